@@ -25,7 +25,7 @@ from hal.registry import Context, takes
 FRAME_BYTES = 37
 BODY = struct.Struct("<H6fIf")
 SLOW, OVERRANGE, INVALID, RAW = 1, 2, 4, 8
-SINC_S = 19.53125e-6  # sampling period for one unit of filter length
+SINC_S = 19.53125e-6  # sampling period per unit of filter length
 POWER_UP_TEXT = b"App Init"
 BAUD_CODES = {9600: 0, 57_600: 1, 115_200: 2, 230_400: 3, 460_800: 4}
 ANSWER_S = 0.25
@@ -41,12 +41,12 @@ class BotaOptions(SerialOptions, RangeOptions):
 
 
 def framer() -> Framer:
-    """AA, 34 bytes, CRC over them."""
+    """Return a framer for AA, 34 bytes, and a CRC over them."""
     return Framer(b"\xaa", FRAME_BYTES, lambda f: crc_x25(f[1:-2]) == f[-2] | f[-1] << 8)
 
 
 class Bota(StreamDevice[Wrench]):
-    """A wrist sensor on a serial line."""
+    """Bota SensONE force/torque sensor on a serial line."""
 
     kind = DeviceKind.FORCE_TORQUE
 
@@ -59,27 +59,27 @@ class Bota(StreamDevice[Wrench]):
         self._host = HostTime()
         self._last_us: int | None = None
         self._bad_before = 0
-        self._tail = b""  # of the last chunk: the power-up text may come in two
+        self._tail = b""  # end of the last chunk: the power-up text may be split over two chunks
         self._wants_lines = False
 
     @property
     def period_s(self) -> float:
-        """Time between samples."""
+        """Return the time between samples, in seconds."""
         return self._options.sinc_length * SINC_S
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return capabilities(self._options, 1.0 / self.period_s)
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        """Newest raw wrench."""
+        """Return the newest raw wrench."""
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Into set-up mode, calibrated values in binary frames, set the filter, run."""
+        """Enter set-up mode, select calibrated values in binary frames, set the filter, and run."""
         self._command(link, "C")
         if (baud_code := BAUD_CODES.get(self._options.baud)) is not None:
-            with suppress(NoAnswer, Refused):  # then it stays as it was left: its frames show what that is
+            with suppress(NoAnswer, Refused):  # the sensor then keeps its old settings, which its frames reveal
                 self._command(link, f"c,0,1,0,{baud_code}", attempts=2)
         self._command(link, f"f,{self._options.sinc_length},0,0,0")
         drain_until_quiet(link, quiet_s=0.01, until_s=now_s() + ANSWER_S)
@@ -90,9 +90,10 @@ class Bota(StreamDevice[Wrench]):
         self._host.reset()
 
     def _command(self, link: Link, text: str, *, attempts: int = ATTEMPTS) -> None:
-        """Send until `r,0,X,0` stands among the data, X being the command's letter.
+        """Send a command until `r,0,X,0` appears among the data, where X is the command's letter.
 
-        The maker's own client ends no command; others read lines. What was understood last is tried first.
+        The maker's own client sends no line end, but other parsers read lines. The variant that worked last is tried
+        first.
         """
         refusal = b""
         for attempt in range(attempts):
@@ -114,7 +115,7 @@ class Bota(StreamDevice[Wrench]):
         raise NoAnswer(f"the sensor does not confirm {text!r}; wrong baud rate or another device?")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each complete frame; the power-up text means that the sensor has forgotten its set-up."""
+        """Publish each complete frame; the power-up text means that the sensor has lost its settings."""
         if POWER_UP_TEXT in self._tail + chunk:
             raise NoAnswer("the sensor has started anew")
         self._tail = (self._tail + chunk)[1 - len(POWER_UP_TEXT) :]
@@ -124,7 +125,7 @@ class Bota(StreamDevice[Wrench]):
     def _take(self, frame: bytes, arrived_s: float) -> None:
         status, fx, fy, fz, tx, ty, tz, stamp_us, _ = BODY.unpack(frame[1:-2])
         if stamp_us == self._last_us:
-            return  # the same frame twice
+            return  # repeated frame
         self._last_us = stamp_us
         device_s = self._clock.seconds(stamp_us)
         value = Wrench(force_n=np.array([fx, fy, fz], dtype=float), torque_nm=np.array([tx, ty, tz], dtype=float))

@@ -1,4 +1,4 @@
-"""A folder of pictures or a video file as a camera: recorded scenes through the same interface as a live one."""
+"""Camera that plays a folder of pictures or a video file through the same interface as a live camera."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class CameraFilesOptions(LensOptions):
 
 
 class CameraFiles(FilePlayer[Image]):
-    """Plays pictures, or the frames of a video."""
+    """Plays pictures, or the frames of a video, as a camera."""
 
     kind = DeviceKind.CAMERA
 
@@ -44,7 +44,7 @@ class CameraFiles(FilePlayer[Image]):
         self._size = (first.shape[1], first.shape[0])
 
     def capabilities(self) -> CameraCapabilities:
-        """Size of the first picture; all others must have it."""
+        """Return the capabilities; the image size is that of the first picture, which all others must have."""
         width_px, height_px = self._size
         return CameraCapabilities(
             width_px=width_px,
@@ -55,15 +55,15 @@ class CameraFiles(FilePlayer[Image]):
         )
 
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
-        """The next picture, not before its period has come.
+        """Return the next picture, not before its period has elapsed.
 
         Raises:
-            DeviceTimeout: the deadline ends before the period. DeviceUnavailable: the last picture has been shown.
+            DeviceTimeout: the deadline ends before the period. DeviceUnavailable: there are no more pictures.
         """
         return self.play(deadline)
 
     def show(self, index: int, shown_s: float) -> None:
-        """One picture."""
+        """Load and publish one picture."""
         self.publish(Image(pixels=self._load(index), exposure_s=self._options.exposure_s), valid_s=shown_s)
 
     def _open(self) -> list[Path] | list[Pixels]:

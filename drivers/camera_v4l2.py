@@ -1,4 +1,4 @@
-"""A V4L2 camera (USB webcams, MIPI) by OpenCV: one thread grabs, readers get a frame exposed after their call."""
+"""V4L2 camera (USB webcams, MIPI) by OpenCV: one thread grabs, and readers get a frame exposed after their call."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ class CameraV4l2Options(LensOptions, WireOptions):
     exposure_s: Annotated[float, Field(gt=0, le=1)] | None = None
 
     def claims(self) -> tuple[ResourceClaim, ...]:
-        """The camera."""
+        """Claim the camera."""
         return (ResourceClaim(wire=f"camera {self.device}"),)
 
 
 class Grabber(Protocol):
-    """What is used of an OpenCV capture."""
+    """The part of an OpenCV capture that the driver uses."""
 
     def read(self) -> tuple[bool, NDArray[Any]]:
-        """Wait for the next frame."""
+        """Wait for the next frame; return whether it was read, and its pixels."""
         ...
 
     def close(self) -> None:
@@ -54,7 +54,7 @@ class Grabber(Protocol):
 
 
 class Capture:
-    """An open V4L2 device."""
+    """Open V4L2 device."""
 
     def __init__(self, options: CameraV4l2Options, name: str) -> None:
         if not options.device.exists():
@@ -78,7 +78,7 @@ class Capture:
             self._video.set(cv2.CAP_PROP_EXPOSURE, options.exposure_s / EXPOSURE_UNIT_S)
 
     def read(self) -> tuple[bool, NDArray[Any]]:
-        """Wait for the next frame."""
+        """Wait for the next frame; return whether it was read, and its pixels."""
         is_good, frame = self._video.read()
         return bool(is_good), frame
 
@@ -88,7 +88,7 @@ class Capture:
 
 
 class CameraV4l2(PortDevice[Image]):
-    """A live camera."""
+    """Live V4L2 camera."""
 
     kind = DeviceKind.CAMERA
 
@@ -102,7 +102,7 @@ class CameraV4l2(PortDevice[Image]):
         self.port: Port[Grabber] = Port(context.name, open_link=opener, tenant=self)
 
     def capabilities(self) -> CameraCapabilities:
-        """As asked for; frames of another size are refused."""
+        """Return the requested size and lens; frames of another size are rejected."""
         o = self._options
         return CameraCapabilities(
             width_px=o.width_px,
@@ -113,15 +113,18 @@ class CameraV4l2(PortDevice[Image]):
         )
 
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
-        """A frame that began after this call; its stamp is a period before its arrival, the earliest possible."""
+        """Return a frame whose exposure began after this call.
+
+        Its stamp is one period before arrival, the earliest possible.
+        """
         return self.newest(deadline, not_before_s=self.context.clock.now_s())
 
-    def set_up(self, link: Grabber) -> None:  # noqa: ARG002  # nothing to ask it
-        """The grabber is set up when it is opened."""
+    def set_up(self, link: Grabber) -> None:  # noqa: ARG002  # there is nothing to configure
+        """Do nothing: the grabber is configured when it is opened."""
         self._failures = 0
 
     def serve(self, link: Grabber) -> None:
-        """One frame."""
+        """Grab and publish one frame."""
         is_good, frame = link.read()
         arrived_s = now_s()
         if not is_good:
@@ -138,7 +141,7 @@ class CameraV4l2(PortDevice[Image]):
         self.publish(image, valid_s=arrived_s - 1.0 / o.rate_hz)
 
     def link_name(self) -> str:
-        """The device."""
+        """Return the device's path."""
         return f"v4l2 {self._options.device}"
 
 

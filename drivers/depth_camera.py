@@ -1,6 +1,7 @@
 """A folder of depth pictures as a range scanner: what the recorders of RGB-D and ToF cameras write.
 
-`.png` with 16 bits (`unit_m` a count, 0 is nothing), `.npy` and the first array of `.npz` in metres (0: nothing).
+`.png` with 16 bits (`unit_m` per count; 0 is no reading), `.npy` and the first array of `.npz` in metres (0: no
+reading).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class DepthCameraOptions(Strict):
 
 
 class DepthCamera(FilePlayer[RangeImage]):
-    """Plays depth pictures again and again, one a period."""
+    """Plays depth pictures in an endless loop, one per period."""
 
     kind = DeviceKind.RANGE_SCANNER
 
@@ -62,7 +63,7 @@ class DepthCamera(FilePlayer[RangeImage]):
         self._shape = self._load(0).shape
 
     def capabilities(self) -> RangeScannerCapabilities:
-        """Size of the first picture, lens and limits of the options."""
+        """Return the size of the first picture, with lens and limits from the options."""
         o = self._options
         return RangeScannerCapabilities(
             projection=o.projection,
@@ -79,11 +80,11 @@ class DepthCamera(FilePlayer[RangeImage]):
         )
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
-        """The next picture, not before its period has come."""
+        """Return the next picture, not before its period has elapsed."""
         return self.play(deadline)
 
     def show(self, index: int, shown_s: float) -> None:
-        """One depth picture."""
+        """Load and publish one depth picture."""
         depth_m = self._load(index)
         is_seen = bool(np.isfinite(depth_m).any())
         self.publish(

@@ -1,6 +1,7 @@
 """Robotiq FT 300 and 300-S force/torque sensors: the 100 Hz stream, or registers over Modbus RTU (FT-300 manual, p 65).
 
-Neither way brings a time stamp: the host's time less the frame's time on the line, or the middle of the exchange.
+Neither way has a time stamp; the time used is arrival minus the frame's time on the line, or the middle of the
+exchange.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ STREAM_RATE_HZ = 100.0
 COUNTS_PER_N, COUNTS_PER_NM = 100.0, 1000.0
 WRENCH_REGISTER, FIRMWARE_REGISTER, STREAM_REGISTER = 180, 500, 410
 START_STREAM = 0x0200
-STOP_S, STOP_BURST = 0.6, 50  # FF bytes for about half a second end a stream
-LISTEN_S = 0.08  # the maker's code takes a line that was silent for so long as no stream
+STOP_S, STOP_BURST = 0.6, 50  # FF bytes for about half a second stop a stream
+LISTEN_S = 0.08  # like the maker's code, treats a line silent for this long as having no stream
 STREAMING_FRAMES = 2
 ANSWER_S = 0.3
 
@@ -54,7 +55,7 @@ class PollOptions(ModbusOptions, RangeOptions):
 
 
 def wrench(counts: tuple[int, ...]) -> Wrench:
-    """Newtons and newton metres from the six signed counts."""
+    """Return the wrench in newtons and newton metres from the six signed counts."""
     return Wrench(
         force_n=np.array(counts[:3], dtype=float) / COUNTS_PER_N,
         torque_nm=np.array(counts[3:6], dtype=float) / COUNTS_PER_NM,
@@ -62,12 +63,12 @@ def wrench(counts: tuple[int, ...]) -> Wrench:
 
 
 def stream_framer() -> Framer:
-    """`20 4E`, six counts, CRC; little-endian."""
+    """Return a framer for `20 4E`, six counts and CRC, little-endian."""
     return Framer(b"\x20\x4e", FRAME_BYTES, lambda f: crc_modbus(f[:-2]) == f[-2] | f[-1] << 8)
 
 
 def condition(value: Wrench, options: RangeOptions) -> tuple[Quality, Cause]:
-    """Saturated beyond the measuring range."""
+    """Return quality and cause; a wrench beyond the measuring range is saturated."""
     is_over = bool(
         np.any(np.abs(value.force_n) > options.force_range_n)
         or np.any(np.abs(value.torque_nm) > options.torque_range_nm)
@@ -76,10 +77,10 @@ def condition(value: Wrench, options: RangeOptions) -> tuple[Quality, Cause]:
 
 
 def identify(master: ModbusMaster, unit: int) -> None:
-    """The firmware registers tell the sensor from another slave; a table without them must hold a wrench.
+    """Check that the device is the sensor by its firmware registers; without them, its table must hold a wrench.
 
     Raises:
-        NoAnswer, Refused, LinkLost: it is not the sensor, or not there.
+        NoAnswer, Refused, LinkLost: the device is not the sensor, or is absent.
     """
     until_s = now_s() + max(ANSWER_S, master.attempt_s)
     try:
@@ -97,7 +98,7 @@ def _end_stream(link: Link) -> None:
 
 
 class Ft300Stream(StreamDevice[Wrench]):
-    """The sensor as a talker: 100 frames a second."""
+    """Sensor in streaming mode: 100 frames per second."""
 
     kind = DeviceKind.FORCE_TORQUE
 
@@ -110,15 +111,18 @@ class Ft300Stream(StreamDevice[Wrench]):
         self._times = FrameTimes(period_s=1.0 / STREAM_RATE_HZ, frame_bytes=FRAME_BYTES)
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return capabilities(self._options, STREAM_RATE_HZ)
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        """Newest raw wrench."""
+        """Return the newest raw wrench."""
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Take over a stream that runs; else end whatever comes, see that it is the sensor, start the stream."""
+        """Take over a running stream.
+
+        Otherwise stop any output, check that the device is the sensor, and start the stream.
+        """
         self._framer.reset()
         self._times.reset()
         heard, frames, until_s = 0, 0, now_s() + LISTEN_S
@@ -133,7 +137,7 @@ class Ft300Stream(StreamDevice[Wrench]):
         try:
             identify(master, unit)
         except NoAnswer:
-            _end_stream(link)  # it may have been in the pause of a stream
+            _end_stream(link)  # the silence may have been a pause in a stream
             identify(master, unit)
         start = [START_STREAM]
         master.write_registers(unit=unit, address=STREAM_REGISTER, values=start, until_s=now_s() + ANSWER_S)
@@ -152,7 +156,7 @@ class Ft300Stream(StreamDevice[Wrench]):
 
 
 class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
-    """The sensor as a Modbus slave, beside others on its bus."""
+    """Sensor as a Modbus slave, beside others on its bus."""
 
     kind = DeviceKind.FORCE_TORQUE
 
@@ -162,19 +166,19 @@ class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
         self._options = options
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return capabilities(self._options, self._options.rate_hz)
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        """Newest raw wrench."""
+        """Return the newest raw wrench."""
         return self.newest(deadline)
 
     def set_up(self, client: ModbusMaster) -> None:
-        """See that it is the sensor."""
+        """Check that the device is the sensor."""
         identify(client, self._options.unit)
 
     def poll(self, client: ModbusMaster) -> None:
-        """Six registers."""
+        """Read the six registers."""
         unit, until_s = self._options.unit, now_s() + client.attempt_s
         words = client.read_registers(unit=unit, address=WRENCH_REGISTER, count=6, until_s=until_s)
         value = wrench(struct.unpack(">6h", struct.pack(">6H", *words)))

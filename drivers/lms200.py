@@ -1,6 +1,6 @@
 """SICK LMS 200 family over RS-232/422 (LMS 2xx telegram listing; frames as in MRPT's CSickLaserSerial).
 
-The scanner is found at any of its four baud rates, left at the wanted one, set to millimetres and told to stream.
+The scanner is found at any of its four baud rates, switched to the configured one, set to millimetres, and started.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LONGEST_PAYLOAD = 812
 WARNING, ERROR, FATAL = 2, 3, 4
 ANSWER_S, SLOW_S = 0.15, 0.6
 SET_UP_S = 3.0
-CONNECT_S = 9.0  # four baud rates, three requests at each and then a patient one
+CONNECT_S = 9.0  # four baud rates with three requests each, then one with a longer wait
 HEADER_BYTES = 4
 KEPT_BYTES = 4096
 
@@ -50,13 +50,13 @@ class Lms200Options(SerialOptions):
 
 
 def telegram(payload: bytes, *, address: int = 0) -> bytes:
-    """`02 addr len16 payload crc16`."""
+    """Return the telegram `02 addr len16 payload crc16`."""
     body = struct.pack("<BBH", 2, address, len(payload)) + payload
     return body + struct.pack("<H", crc_sick(body))
 
 
 def framer(address: int = 0x80, *, payload_bytes: int | None = None) -> Framer:
-    """Telegrams from one side, of that length alone where it is given: no false header makes a true one wait then."""
+    """Return a framer for telegrams from one side; if the length is given, a false header cannot delay a true one."""
 
     def length(data: bytes) -> int | None:
         size = _length(data)
@@ -70,7 +70,7 @@ def _is_whole(frame: bytes) -> bool:
 
 
 def payloads_in(seen: bytes) -> Iterator[bytes]:
-    """Of all whole telegrams, also behind a false header that promises more bytes than will ever come."""
+    """Yield the payloads of all complete telegrams, also after a false header that promises more bytes than will come."""
     at = seen.find(b"\x02\x80")
     while at >= 0:
         frame = seen[at : at + (_length(seen[at:]) or 0)]
@@ -87,7 +87,7 @@ def _length(data: bytes) -> int | None:
 
 
 class Lms200(LineScanner):
-    """A SICK scanner."""
+    """SICK LMS 200 scanner."""
 
     def __init__(self, context: Context, options: Lms200Options) -> None:
         opener, name = serial_opener(options, context.name)
@@ -98,7 +98,7 @@ class Lms200(LineScanner):
             step_rad=math.radians(step_deg),
             min_range_m=0.0,
             max_range_m=options.max_range_m,
-            scan_s=0.0133 / step_deg,  # 75 turns a second, interleaved for finer steps
+            scan_s=0.0133 / step_deg,  # 75 turns per second, interleaved for finer steps
         )
         line_s = (2 * beams.count + 10) * 10 / options.baud
         super().__init__(context, open_link=opener, link_name=name, max_age_s=3 * max(beams.scan_s, line_s) + 0.1)
@@ -110,7 +110,7 @@ class Lms200(LineScanner):
         self._last = (b"", 0.0)
 
     def start(self, link: Link) -> None:
-        """Find it, stop it, change the baud rate, set angles and unit, stream."""
+        """Find the scanner, stop it, change the baud rate, set angles and unit, and start the stream."""
         o = self._options
         if self._find(link) != o.baud:
             self._set_mode(link, bytes([BAUD_CODES[o.baud]]))
@@ -136,7 +136,7 @@ class Lms200(LineScanner):
             raise Refused(f"operating mode {mode[0]:02X}h is refused", code=answer[1])
 
     def _find(self, link: Link) -> int:
-        """Try all baud rates, the wanted one first, until it agrees to stop streaming; at which rate it did."""
+        """Return the baud rate at which the scanner agrees to stop streaming; the configured rate is tried first."""
         rates = sorted(BAUD_CODES, key=lambda rate: rate != self._options.baud)
         for answer_s, attempts in ((ANSWER_S, 3), (SLOW_S, 1)):
             for rate in rates:
@@ -158,11 +158,11 @@ class Lms200(LineScanner):
     def _ask(
         link: Link, payload: bytes, code: int, wait_s: float = 0.0, *, answer_s: float = ANSWER_S, attempts: int = 3
     ) -> bytes:
-        """Payload of the answer with `code`.
+        """Return the payload of the answer with `code`.
 
         Args:
-            wait_s: how long the answer to a request may take that the scanner has acknowledged. A request is repeated
-                sooner only without that; then the answers to all of them are let pass.
+            wait_s: how long to wait for the answer to an acknowledged request. Without acknowledgement the request is
+                repeated sooner; afterwards the answers to all repetitions are discarded.
         """
         asked_s = now_s()
         for attempt in range(attempts):
@@ -189,7 +189,7 @@ class Lms200(LineScanner):
 
     def _take(self, frame: bytes, arrived_s: float) -> None:
         if frame == self._last[0] and arrived_s - self._last[1] < 0.3 * (self.beams.scan_s if self.beams else 0.0):
-            return  # the same telegram twice
+            return  # repeated telegram
         self._last = (frame, arrived_s)
         status = frame[-3]
         if status & 7 >= FATAL:
@@ -205,7 +205,7 @@ class Lms200(LineScanner):
 
 
 def decode_scan(payload: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Metres out of a B0 answer, empty when it is cut short; codes from 1FF7h on and zero are NaN."""
+    """Return metres from a B0 answer, empty when it is truncated; codes from 1FF7h on and zero become NaN."""
     if len(payload) < 3:
         return np.empty(0)
     word = payload[1] | payload[2] << 8

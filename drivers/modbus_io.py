@@ -1,6 +1,7 @@
 """Remote I/O over Modbus TCP or RTU (Moxa ioLogik E1200 map): lights, touch, proximity switches, stop input.
 
-Outputs are coils from 0, inputs discrete inputs from 0; all inputs come in one request, so they belong together.
+Outputs are coils from 0, inputs discrete inputs from 0; one request reads all inputs, so their values are consistent.
+Devices on the same link share one bus.
 Devices with the same wire share one bus.
 """
 
@@ -44,7 +45,7 @@ class IoOptions(ModbusOptions):
         return self
 
     def wired(self) -> tuple[int, ...]:
-        """Inputs in use."""
+        """Return the numbers of the inputs in use."""
         return ()
 
 
@@ -66,7 +67,7 @@ class LightsOptions(IoOptions):
         return self
 
     def wired(self) -> tuple[int, ...]:
-        """Feedback and stop input."""
+        """Return the feedback inputs and the stop input."""
         return self.feedback if self.stop_input is None else (*self.feedback, self.stop_input)
 
 
@@ -83,7 +84,7 @@ class TouchOptions(IoOptions):
         return self
 
     def wired(self) -> tuple[int, ...]:
-        """The pads' inputs."""
+        """Return the inputs of the touch pads."""
         return self.contacts
 
 
@@ -95,7 +96,7 @@ class SwitchOptions(IoOptions):
     sigma_m: Annotated[float, Field(gt=0)] = 0.002
 
     def wired(self) -> tuple[int, ...]:
-        """The switch's input."""
+        """Return the input of the switch."""
         return (self.input,)
 
 
@@ -107,21 +108,21 @@ class IoDevice(PolledDevice[T, ModbusMaster]):
         self._io = options
 
     def set_up(self, client: ModbusMaster) -> None:
-        """Nothing to set: the poll identifies it."""
+        """Do nothing: the poll itself identifies the device."""
 
     def poll(self, client: ModbusMaster) -> None:
-        """All inputs in one request."""
+        """Read all inputs in one request."""
         io = self._io
         inputs = client.read_bits(unit=io.unit, address=0, count=io.inputs, until_s=now_s() + client.attempt_s)
         self.take(inputs, self.exchanges.taken_s(client.asked_s, now_s()))
 
     @abstractmethod
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
-        """Publish what these inputs mean."""
+        """Publish the value that these inputs represent."""
 
 
 class IoLights(IoDevice[tuple[bool, ...]]):
-    """The panel's border lights: outputs switch them, inputs say whether they burn."""
+    """Border lights of the panel: outputs switch them, inputs report whether they are lit."""
 
     kind = DeviceKind.LIGHTS
 
@@ -133,11 +134,11 @@ class IoLights(IoDevice[tuple[bool, ...]]):
         self._commanded_s = -math.inf
 
     def capabilities(self) -> LightsCapabilities:
-        """Channel names from the options."""
+        """Return the channel names given by the options."""
         return LightsCapabilities(channels=self._channels, settle_s=self._options.settle_s)
 
     def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
-        """Switch all lights; the device's acknowledgement is awaited."""
+        """Switch all lights and wait for the device's acknowledgement."""
         wanted = wanted_lights(self.name, self._channels, on)
         self.call(lambda client, until_s: self._write(client, wanted, until_s), deadline)
         self._wanted = wanted
@@ -145,17 +146,17 @@ class IoLights(IoDevice[tuple[bool, ...]]):
         return wanted
 
     def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """Newest feedback, never from before the last command."""
+        """Return the newest feedback, never from before the last command."""
         oldest_s = self.context.clock.now_s() - self.max_age_s
         return self.newest(deadline, not_before_s=max(oldest_s, self._commanded_s))
 
     def set_up(self, client: ModbusMaster) -> None:
-        """After a loss the lights return to what was last commanded."""
+        """Restore the last commanded state of the lights after a loss."""
         if self._wanted is not None:
             self._write(client, self._wanted, now_s() + client.attempt_s)
 
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
-        """Feedback; degraded while the stop circuit is open."""
+        """Publish the feedback; degraded while the stop circuit is open."""
         stop = self._options.stop_input
         is_healthy = stop is None or inputs[stop]
         self.publish(
@@ -166,7 +167,7 @@ class IoLights(IoDevice[tuple[bool, ...]]):
         )
 
     def release(self) -> None:
-        """Leave the lights off, if the wire still takes it, and leave the bus."""
+        """Switch the lights off, if the link still works, and detach from the bus."""
         with suppress(WireError):
             off = (False,) * len(self._channels)
             self.bus.call(lambda client, until_s: self._write(client, off, until_s), now_s() + CLOSE_S)
@@ -196,21 +197,21 @@ class IoTouch(IoDevice[tuple[bool, ...]]):
         self._options = options
 
     def capabilities(self) -> TouchCapabilities:
-        """Channel names and threshold from the options."""
+        """Return channel names and threshold given by the options."""
         o = self._options
         return TouchCapabilities(channels=o.channels, threshold_n=o.threshold_n, rate_hz=o.rate_hz)
 
     def read_contacts(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """Newest state of the pads."""
+        """Return the newest state of the pads."""
         return self.newest(deadline)
 
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
-        """The pads' inputs."""
+        """Publish the states of the pads' inputs."""
         self.publish(tuple(inputs[i] for i in self._options.contacts), valid_s=valid_s)
 
 
 class IoSwitch(IoDevice[float]):
-    """A proximity switch: it knows one distance, and says nothing beyond it."""
+    """Proximity switch: it detects one distance and gives no value beyond it."""
 
     kind = DeviceKind.PROXIMITY
 
@@ -219,18 +220,18 @@ class IoSwitch(IoDevice[float]):
         self._options = options
 
     def capabilities(self) -> ProximityCapabilities:
-        """One distance."""
+        """Return a range of one distance."""
         o = self._options
         return ProximityCapabilities(
             min_range_m=0.0, max_range_m=o.switching_distance_m, sigma_m=o.sigma_m, rate_hz=o.rate_hz
         )
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """The switching distance while the switch is on (degraded: nearer is possible), else invalid."""
+        """Return the switching distance while the switch is on (degraded: the surface may be nearer), else an invalid reading."""
         return self.newest(deadline)
 
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:
-        """On: at most the switching distance away."""
+        """Publish the reading: when on, the surface is at most the switching distance away."""
         is_near = inputs[self._options.input]
         self.publish(
             self._options.switching_distance_m if is_near else math.nan,

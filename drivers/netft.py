@@ -1,6 +1,6 @@
 """ATI Net F/T and Axia80 over UDP, raw data transfer (ATI 9610-05, pp 75-76).
 
-A record has a sequence number, so lost, repeated and late ones are told apart; `status` other than 0 marks it invalid.
+Each record has a sequence number, which reveals lost, repeated and late records; a nonzero `status` marks it invalid.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class NetftOptions(UdpOptions, RangeOptions):
 
 
 def request(command: int, count: int = 0) -> bytes:
-    """1234h, command, number of records (0: endless)."""
+    """Return the request: 1234h, command, number of records (0: endless)."""
     return struct.pack(">HHI", HEADER, command, count)
 
 
 class Netft(StreamDevice[Wrench]):
-    """A wrist sensor on the network."""
+    """ATI force/torque sensor on the network."""
 
     kind = DeviceKind.FORCE_TORQUE
 
@@ -55,29 +55,29 @@ class Netft(StreamDevice[Wrench]):
         self._may_be_new = False
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return capabilities(self._options, self._options.rate_hz)
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        """Newest raw wrench."""
+        """Return the newest raw wrench."""
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Stop a stream that was left on, start a fresh one."""
+        """Stop any running stream and start a new one."""
         link.write(request(STOP), now_s() + SEND_S)
         drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + SEND_S)
         link.write(request(STREAM), now_s() + SEND_S)
         self._last = None
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """One datagram is one record; other lengths are not ours."""
+        """Publish the record; each datagram holds one, and datagrams of other lengths are ignored."""
         if len(chunk) != RECORD.size:
             return
         sequence, samples, status, *counts = RECORD.unpack(chunk)
         is_new_stream = self._begins_stream(sequence, samples)
         last = None if is_new_stream else self._last
         if last is not None and sequence <= last:
-            return  # repeated or late
+            return  # repeated or late record
         self._last, self._last_sample = sequence, samples
         o = self._options
         value = Wrench(
@@ -93,8 +93,10 @@ class Netft(StreamDevice[Wrench]):
         )
 
     def _begins_stream(self, sequence: int, samples: int) -> bool:
-        """Has the sensor begun to count anew? A late first record has an old sample count; a restarted sensor has too,
-        but then the second record follows."""
+        """Return whether the sensor has restarted its counting.
+
+        Both a late record and a restarted sensor show an old sample count; after a restart the second record follows.
+        """
         if self._last is None or sequence > self._last:
             self._may_be_new = False
             return False
@@ -104,7 +106,7 @@ class Netft(StreamDevice[Wrench]):
         return self._may_be_new and sequence == FIRST_SEQUENCE + 1
 
     def release(self) -> None:
-        """Stop the stream: a talking sensor loads the network for ever."""
+        """Stop the stream, because the sensor would otherwise load the network for ever."""
         link = self.port.link
         super().release()
         if link is not None:

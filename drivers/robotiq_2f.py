@@ -1,7 +1,7 @@
 """Robotiq 2F-85, 2F-140 and Hand-E grippers over Modbus RTU (2F-85/140 manual, pp 58-60).
 
-Activation moves the jaws, so it happens once, when the driver is connected; a gripper that loses its activation
-later says so and waits to be connected again.
+Activation moves the jaws, so it happens once, when the driver connects; if the gripper loses its activation later,
+the driver reports that and waits to be connected again.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FAULTS = {
     14: "too much current",
     15: "automatic release done",
 }
-PASSING_FAULTS = (7, 9)  # end with activation and with the next command: no reason to refuse a connection to do so
+PASSING_FAULTS = (7, 9)  # cleared by activation or the next command: no reason to refuse the connection
 VALID = (Quality.VALID, Cause.NONE)
 
 
@@ -67,7 +67,7 @@ class GripperOptions(ModbusOptions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
-    """Registers 07D0-07D2."""
+    """Contents of registers 07D0-07D2."""
 
     is_activated: bool
     goes_to: bool
@@ -80,7 +80,7 @@ class Status:
 
 
 def decode_status(words: tuple[int, ...]) -> Status:
-    """gACT, gGTO, gSTA, gOBJ | 0 | 0, gFLT | gPR | gPO | gCU of three registers."""
+    """Decode gACT, gGTO, gSTA, gOBJ | 0 | 0, gFLT | gPR | gPO | gCU from three registers."""
     s = words[0] >> 8
     return Status(
         is_activated=bool(s & 1),
@@ -95,12 +95,12 @@ def decode_status(words: tuple[int, ...]) -> Status:
 
 
 def encode_command(*, action: int, position: int = 0, speed: int = 0, force: int = 0) -> tuple[int, int, int]:
-    """rACT, rGTO | 0 | 0 | rPR | rSP | rFR as three registers."""
+    """Encode rACT, rGTO | 0 | 0 | rPR | rSP | rFR as three registers."""
     return action << 8, position, speed << 8 | force
 
 
 class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
-    """A two-finger gripper."""
+    """Robotiq two-finger gripper."""
 
     kind = DeviceKind.GRIPPER
 
@@ -112,18 +112,21 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         self._force_n = 0.0
 
     def capabilities(self) -> GripperCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         o = self._options
         return GripperCapabilities(
             min_width_m=0.0, max_width_m=o.stroke_m, max_force_n=o.max_force_n, max_speed_m_per_s=o.max_speed_m_per_s
         )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
-        """Newest width and grip; the force is the commanded one while it holds, as the gripper measures none."""
+        """Return the newest width and grip.
+
+        While it holds, the force is the commanded one, as the gripper measures none.
+        """
         return self.newest(deadline)
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
-        """Start to move; returns the width that the nearest count stands for."""
+        """Start a motion; return the width of the nearest count."""
         o = self._options
         require_finite(self.name, width_m, force_n, speed_m_per_s)
         goal = self._count(min(max(width_m, 0.0), o.stroke_m))
@@ -141,9 +144,9 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         return self._width_m(goal)
 
     def activate(self) -> None:
-        """Clear and set rACT unless the gripper is active, then wait for the jaws to have found their ends.
+        """Clear and set rACT unless the gripper is active, then wait until the jaws have found their end positions.
 
-        Each exchange is repeated by itself until it succeeds, so that a bad wire only makes it slower.
+        Each exchange is repeated on its own until it succeeds, so a bad line only makes it slower.
 
         Raises:
             DeviceFault, DeviceTimeout, DeviceUnavailable: not active within `activation_s`.
@@ -157,7 +160,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
                     self._act(actions[0])
                     actions = actions[1:]
                 elif self.call(self._status, self._soon()).state == READY:
-                    self.mailbox.clear()  # of what was read before
+                    self.mailbox.clear()  # discard values from before the activation
                     return
                 elif actions is None:
                     actions = [0, ACTIVATE]
@@ -179,17 +182,17 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         return Deadline.after(self.context.clock, 6 * self._options.timeout_s)
 
     def set_up(self, client: ModbusMaster) -> None:
-        """Nothing that moves: the poll tells what state it is in."""
+        """Do nothing, because nothing may move here; the poll reads the gripper's state."""
 
     def poll(self, client: ModbusMaster) -> None:
-        """Three registers to width and grip."""
+        """Read three registers and publish width and grip."""
         status = self._status(client, now_s() + client.attempt_s)
         if status.fault > ACTIVATION_PENDING and status.fault not in PASSING_FAULTS:
             text = FAULTS.get(status.fault, "fault not in the manual")
             raise Refused(f"gripper fault {status.fault:X}h: {text}", code=status.fault)
         is_known = (
             status.state == READY and status.fault not in PASSING_FAULTS
-        )  # before activation it counts from anywhere
+        )  # before activation the position count has no reference
         quality, cause = VALID if is_known else (Quality.INVALID, Cause.DEVICE)
         is_current = self._goal is None or status.echo == self._goal
         is_holding = is_current and status.object in (OPENED_ON, CLOSED_ON)

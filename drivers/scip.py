@@ -21,10 +21,10 @@ from drivers.transport.options import EitherOptions, PortNumber, SerialPath, eit
 from drivers.transport.timebase import HostTime, Unwrapper
 from hal.registry import Context, takes
 
-FIRST_DISTANCE_MM = 20  # below are error codes
+FIRST_DISTANCE_MM = 20  # smaller values are error codes
 STAMP_BITS, STAMP_S = 24, 0.001
 ANSWER_S = 0.5
-MESSAGE_LIMIT = 20_000  # no scanner's message is longer
+MESSAGE_LIMIT = 20_000  # longer than any scanner's message
 OK, LASER_ALREADY_ON, DATA, RESUMED = "00", "02", "99", "98"
 
 
@@ -39,7 +39,7 @@ class ScipOptions(EitherOptions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Message:
-    """One answer: its echo, its status and the lines that follow, sums checked and taken off."""
+    """One answer: its echo, its status and the lines that follow, with checksums verified and removed."""
 
     echo: str
     status: str
@@ -47,7 +47,7 @@ class Message:
 
 
 def decode_number(text: bytes) -> int:
-    """Six bits a character, high first, each plus 30h."""
+    """Decode a number with six bits per character, high first, each plus 30h."""
     value = 0
     for character in text:
         value = value << 6 | (character - 0x30)
@@ -55,7 +55,7 @@ def decode_number(text: bytes) -> int:
 
 
 def decode_ranges_mm(data: bytes) -> NDArray[np.int32]:
-    """Distances of three characters each; the lines must have been joined, as values straddle them."""
+    """Decode distances of three characters each; join the lines first, because values may straddle them."""
     packed = np.zeros((len(data) // 3, 4), np.uint8)
     packed[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
     bits = packed.view(">u4")[:, 0].astype(np.int32) - 0x303030  # 00hhhhhh 00mmmmmm 00llllll
@@ -63,13 +63,16 @@ def decode_ranges_mm(data: bytes) -> NDArray[np.int32]:
 
 
 def is_encoded(data: bytes) -> bool:
-    """Are all characters within 30h to 6Fh? The sum has six bits and cannot see the upper two of a character."""
+    """Return whether all characters are within 30h to 6Fh; the six-bit sum does not cover the upper two bits."""
     c = np.frombuffer(data, np.uint8)
     return bool(np.all(c - np.uint8(0x30) < 0x40))
 
 
 def checked(line: bytes) -> bytes | None:
-    """The line without its sum; None when the sum is wrong. Of `KEY:value;` lines makers sum with or without the `;`."""
+    """Return the line without its checksum, or None if that is wrong.
+
+    Makers sum `KEY:value;` lines with or without `;`.
+    """
     if not line:
         return None
     body, sum_ = line[:-1], line[-1]
@@ -78,20 +81,20 @@ def checked(line: bytes) -> bytes | None:
 
 
 class ScipParser:
-    """Answers out of bytes in any chunks: an answer ends with an empty line."""
+    """Parses answers from bytes in chunks of any size; an answer ends with an empty line."""
 
     def __init__(self) -> None:
         self._buffer = b""
         self.bad = 0
 
     def reset(self) -> None:
-        """Forget what has been kept."""
+        """Discard the kept bytes."""
         self._buffer = b""
 
     def feed(self, chunk: bytes, echo: str) -> list[Message]:
-        """Whole answers whose echo begins with `echo`; damaged ones are counted."""
+        """Return complete answers whose echo begins with `echo`; damaged ones are counted."""
         self._buffer += chunk
-        if b"\n\n" not in self._buffer[-len(chunk) - 1 :]:  # only the new part can have ended an answer
+        if b"\n\n" not in self._buffer[-len(chunk) - 1 :]:  # only the new part can have completed an answer
             self._buffer = self._buffer[-MESSAGE_LIMIT:]
             return []
         *blocks, self._buffer = self._buffer.split(b"\n\n")
@@ -100,7 +103,7 @@ class ScipParser:
 
     def _message(self, block: bytes, echo: bytes) -> Message | None:
         lines = block.split(b"\n")
-        starts = [i for i, line in enumerate(lines) if echo in line]  # noise may stand before; the last echo counts
+        starts = [i for i, line in enumerate(lines) if echo in line]  # noise may precede it; the last echo counts
         if not starts or len(lines) < starts[-1] + 2:
             self.bad += bool(starts)
             return None
@@ -118,13 +121,13 @@ class ScipParser:
 
 
 def parse_parameters(block: tuple[bytes, ...]) -> dict[str, str]:
-    """`KEY:value;` lines of VV, PP and II answers."""
+    """Return the `KEY:value;` lines of VV, PP and II answers as a dictionary."""
     pairs = (line.decode("ascii", "replace").rstrip(";").split(":", 1) for line in block if b":" in line)
     return {key: value for key, value in pairs}
 
 
 class Scip(LineScanner):
-    """A Hokuyo scanner."""
+    """Hokuyo scanner."""
 
     def __init__(self, context: Context, options: ScipOptions) -> None:
         opener, name = either_opener(options, context.name)
@@ -139,7 +142,7 @@ class Scip(LineScanner):
         self._bad_before = 0
 
     def start(self, link: Link) -> None:
-        """Stop a stream that was left on, learn the geometry, light the laser, stream."""
+        """Stop any running stream, read the geometry, switch the laser on, and start the stream."""
         self._parser.reset()
         link.write(b"\nQT\n", now_s() + ANSWER_S)
         drain_until_quiet(link, quiet_s=0.05, until_s=now_s() + ANSWER_S)
@@ -171,7 +174,7 @@ class Scip(LineScanner):
         )
 
     def _ask(self, link: Link, command: str, *good: str) -> Message:
-        """Send a command and wait for its answer, up to three times."""
+        """Send a command and return its answer; up to three attempts."""
         for _ in range(3):
             link.write(command.encode() + b"\n", now_s() + ANSWER_S)
             until_s = now_s() + ANSWER_S
@@ -199,7 +202,7 @@ class Scip(LineScanner):
             return
         stamp = decode_number(stamp_text)
         if stamp == self._last_stamp:
-            return  # the same scan twice
+            return  # repeated scan
         self._last_stamp = stamp
         range_mm = decode_ranges_mm(data)
         range_m = np.where(range_mm < FIRST_DISTANCE_MM, math.nan, range_mm / 1000.0)

@@ -32,11 +32,11 @@ UNIT_CODES = {"cm": 1, "mm": 6}
 METRES = {"cm": 0.01, "mm": 0.001}
 ANSWER_S = 0.15
 ATTEMPTS = 3
-SILENCE_S = 0.15  # no sensor starts anew in less, and one that has been without power speaks in its factory unit again
+SILENCE_S = 0.15  # no restart is faster than this, and after a power loss the sensor reports in its factory unit again
 
 
 def _exchange(link: Link, request: bytes, is_answered: Callable[[bytes], bool]) -> bytes:
-    """What is heard after a request, until it is answered or the time is over."""
+    """Return what is received after a request, until it is answered or the time is over."""
     link.write(request, now_s() + ANSWER_S)
     heard, until_s = b"", now_s() + ANSWER_S
     while not is_answered(heard) and (chunk := link.read(until_s)):
@@ -53,13 +53,13 @@ class EchoOptions(Strict):
     sigma_m: Annotated[float, Field(gt=0)] = 0.005
 
     def capabilities(self, rate_hz: float) -> ProximityCapabilities:
-        """From the options: the maker's figures are for big, bright targets."""
+        """Return the capabilities given by the options; the maker's figures hold for large, bright targets."""
         return ProximityCapabilities(
             min_range_m=self.min_range_m, max_range_m=self.max_range_m, sigma_m=self.sigma_m, rate_hz=rate_hz
         )
 
     def judge(self, distance_m: float, strength: int) -> tuple[float, Quality, Cause]:
-        """The distance, or NaN and invalid when the echo is too weak, too strong, or from outside the range."""
+        """Return the distance, or NaN and invalid if the echo is too weak, too strong, or out of range."""
         is_seen = (
             self.min_strength <= strength < STRENGTH_SATURATED
             and distance_m > 0.0
@@ -79,18 +79,18 @@ class TfminiOptions(SerialOptions, EchoOptions):
 
 
 def command(code: int, payload: bytes = b"") -> bytes:
-    """`5A len id payload sum`, len counting all bytes."""
+    """Return the command `5A len id payload sum`, where len counts all bytes."""
     head = bytes([0x5A, 4 + len(payload), code]) + payload
     return head + bytes([sum_low_byte(head)])
 
 
 def data_framer() -> Framer:
-    """Data frames; `59 59` also occurs inside frames, so the sum decides."""
+    """Return a framer for data frames; `59 59` also occurs inside frames, so the sum decides."""
     return Framer(b"\x59\x59", FRAME_BYTES, lambda f: sum_low_byte(f[:-1]) == f[-1])
 
 
 class Tfmini(StreamDevice[float]):
-    """A finger's distance sensor."""
+    """Distance sensor of a finger."""
 
     kind = DeviceKind.PROXIMITY
 
@@ -111,18 +111,18 @@ class Tfmini(StreamDevice[float]):
         self._unit_m = METRES[options.unit]
 
     def capabilities(self) -> ProximityCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return self._options.capabilities(self._options.rate_hz)
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """Newest distance; invalid and NaN when the echo is too weak or outside the range."""
+        """Return the newest distance; invalid and NaN when the echo is too weak or out of range."""
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Set unit and rate. A sensor that confirms neither unit was told cm last, which also is its factory unit."""
+        """Set unit and rate; a sensor that confirms neither unit was last set to cm, which is also its factory unit."""
         self._framer.reset()
         self._times.reset()
-        asked = command(GET_VERSION)  # its answer is another, so if it comes back the line echoes
+        asked = command(GET_VERSION)  # if this very command comes back, the line echoes
         seen = _exchange(link, asked, lambda data: VERSION_ANSWER in data)
         is_echoing = asked in seen
         for unit in dict.fromkeys((self._options.unit, "cm")):
@@ -136,9 +136,9 @@ class Tfmini(StreamDevice[float]):
         self._tell(link, SET_RATE, struct.pack("<H", round(self._options.rate_hz)), is_echoing=is_echoing)
 
     def _tell(self, link: Link, code: int, payload: bytes, *, is_echoing: bool) -> tuple[bool, bytes]:
-        """Send a command until its answer stands between the data frames; is it there, and all that was heard.
+        """Send a command until its answer appears between data frames; return whether it came, and all bytes received.
 
-        The answer repeats the command, as the echo of a two-wire line does; where the line echoes, it must come twice.
+        The answer repeats the command, as does the echo of a two-wire line; on a line that echoes it must come twice.
         """
         wanted = command(code, payload)
         seen = b""

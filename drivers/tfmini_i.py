@@ -1,6 +1,6 @@
 """Benewake TFmini-i over Modbus RTU and over CAN, TF03 over CAN (SJ-PM-TFmini-i A01; TF02-i BP-UM-22 A03, p 7).
 
-What a reading means is decided as for the TFmini-Plus; both ways bring the sensor's millisecond clock, the TF03 none.
+Readings are judged as for the TFmini-Plus. Both links carry the sensor's millisecond clock, except with the TF03.
 """
 
 from __future__ import annotations
@@ -45,36 +45,36 @@ class CanTfminiOptions(CanOptions, EchoOptions):
 
     @property
     def stations(self) -> tuple[str, ...]:
-        """The identifier of its frames."""
+        """Return the identifier of the sensor's frames."""
         return (f"identifier 0x{self.id:03X}",)
 
 
 class SensorClock:
-    """The sensor's clock on the host's, and whether a stamp is a new one."""
+    """Converts the sensor's clock to the host's, and detects repeated stamps."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """The wire was opened anew."""
+        """Start again, because the link was reopened."""
         self._device = Unwrapper(bits=STAMP_BITS, tick_s=STAMP_S)
         self._host = HostTime()
         self._last_ms: int | None = None
 
     def is_new(self, stamp_ms: int) -> bool:
-        """Has this measurement not been seen before?"""
+        """Return whether this measurement has not been seen before."""
         is_new = stamp_ms != self._last_ms
         self._last_ms = stamp_ms
         return is_new
 
     def times_s(self, stamp_ms: int, arrived_s: float) -> tuple[float, float]:
-        """The measurement's time on the sensor's clock and on the host's."""
+        """Return the measurement's time on the sensor's clock and on the host's."""
         device_s = self._device.seconds(stamp_ms)
         return device_s, self._host.host_s(device_s=device_s, arrived_s=arrived_s)
 
 
 class ModbusTfmini(PolledDevice[float, ModbusMaster]):
-    """A finger's distance sensor on a shared two-wire bus."""
+    """Distance sensor of a finger on a shared two-wire bus."""
 
     kind = DeviceKind.PROXIMITY
 
@@ -85,21 +85,21 @@ class ModbusTfmini(PolledDevice[float, ModbusMaster]):
         self._clock = SensorClock()
 
     def capabilities(self) -> ProximityCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return self._options.capabilities(self._options.rate_hz)
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """Newest distance; invalid and NaN when the echo is too weak or outside the range."""
+        """Return the newest distance; invalid and NaN when the echo is too weak or out of range."""
         return self.newest(deadline)
 
     def set_up(self, client: ModbusMaster) -> None:
-        """The firmware registers tell a sensor from another slave."""
+        """Check by the firmware registers that the device is the sensor."""
         self._clock.reset()
         until_s = now_s() + client.attempt_s
         client.read_registers(unit=self._options.unit, address=FIRMWARE_REGISTER, count=2, until_s=until_s)
 
     def poll(self, client: ModbusMaster) -> None:
-        """Distance, strength and clock in one request; a measurement that was read before is none."""
+        """Read distance, strength and clock in one request; skip a measurement that was read before."""
         unit, until_s = self._options.unit, now_s() + client.attempt_s
         words = client.read_registers(unit=unit, address=READING_REGISTER, count=5, until_s=until_s)
         raw, strength, _, high, low = words
@@ -112,7 +112,7 @@ class ModbusTfmini(PolledDevice[float, ModbusMaster]):
 
 
 class CanTfmini(StreamDevice[float]):
-    """A finger's distance sensor that talks on a CAN bus."""
+    """Distance sensor of a finger that streams on a CAN bus."""
 
     kind = DeviceKind.PROXIMITY
 
@@ -128,22 +128,22 @@ class CanTfmini(StreamDevice[float]):
         self._with_clock, self._without_clock = struct.Struct(order + "HHI"), struct.Struct(order + "HH")
 
     def capabilities(self) -> ProximityCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return self._options.capabilities(self._options.rate_hz)
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """Newest distance; invalid and NaN when the echo is too weak or outside the range."""
+        """Return the newest distance; invalid and NaN when the echo is too weak or out of range."""
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Open the channel; the sensor talks by itself."""
+        """Open the channel; the sensor streams without being asked."""
         self._codec = self._make_codec()
         self._clock.reset()
         self._times.reset()
         link.write(self._codec.opening(self._options.bitrate), now_s() + OPEN_S)
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each of the sensor's frames; other nodes' and those of another length are not its."""
+        """Publish each of the sensor's frames; frames of other nodes or of another length are ignored."""
         for frame in self._codec.feed(chunk):
             if frame.id == self._options.id:
                 self._take(frame, arrived_s)

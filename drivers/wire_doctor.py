@@ -1,4 +1,4 @@
-"""What is wrong with a wire: ports, permissions, owners, latency timers, the baud rate that answers, measured latency.
+"""Diagnosis of links: ports, permissions, owners, latency timers, working baud rate, measured latency.
 
 `panelwright doctor` finds this by the entry point `panelwright.doctor`.
 """
@@ -31,7 +31,7 @@ BAUDS = (
     460_800,
     921_600,
     230_400,
-)  # each costs seconds: usual ones first
+)  # each attempt takes seconds, so the usual rates come first
 SAMPLES = 30
 SLOW_TIMER_MS = 2
 TIMER_HINT = (
@@ -52,7 +52,7 @@ class Finding:
 
 
 def examine(cell: Cell) -> Iterator[Finding]:
-    """Every serial port of this machine, then every device of the cell that has a wire of its own."""
+    """Examine every serial port of this machine, then every device of the cell that has its own link."""
     for path in serial_ports():
         yield examine_port(path)
     for name, section in cell.file.devices.items():
@@ -62,16 +62,16 @@ def examine(cell: Cell) -> Iterator[Finding]:
 
 
 def serial_path(options: Mapping[str, Any]) -> str | None:
-    """The path of the serial port or slcan adapter that the options name, if they name one."""
+    """Return the path of the serial port or slcan adapter named by the options, if any."""
     found = options.get("port", options.get("channel"))
     return found if isinstance(found, str) and "/" in found else None
 
 
 def examine_port(path: str, *, sysfs: Path = SYSFS) -> Finding:
-    """Is it there, may it be opened, does somebody have it, and how long does its adapter hold bytes back?
+    """Check whether the port exists, may be opened, is held by a process, and how long its adapter buffers bytes.
 
     Args:
-        sysfs: where the kernel describes serial ports.
+        sysfs: directory where the kernel describes serial ports.
     """
     if not Path(path).exists():
         return Finding(path, False, "does not exist", "plug the device in, or correct the path in the cell file")
@@ -95,11 +95,11 @@ def examine_device(
     open_device: Connect | None = None,
     look_at: Callable[[str], Finding] = examine_port,
 ) -> Iterator[Finding]:
-    """Its port, then the device as configured; when it gives no data, at which other baud rate it does.
+    """Examine the device's port, then the device as configured; if it gives no data, try other baud rates.
 
     Args:
-        open_device: connects by name, driver and options; the installed drivers unless given.
-        look_at: what finds out about the port.
+        open_device: connects by name, driver and options; by default uses the installed drivers.
+        look_at: function that examines the port.
     """
     port = look_at(path)
     if not port.is_good:
@@ -131,14 +131,14 @@ def _answering_baud(name: str, driver: str, options: dict[str, Any], opened: Con
             continue
         try:
             opened(name, driver, {**options, "baud": baud}).close()
-        except CellError:  # also a driver that knows no such rate
+        except CellError:  # also raised by a driver that does not support the rate
             continue
         return baud
     return None
 
 
 def measured(device: Any) -> str:
-    """Rate, age of what is read and wait for a sample that is new."""
+    """Return, as text, the sample rate, the age of readings and the wait for a new sample."""
     if not isinstance(device, WireDevice):
         return "answers"
     clock = WallClock()

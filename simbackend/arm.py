@@ -55,7 +55,7 @@ class SimArm(SimDevice[JointState]):
         return self._capabilities
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Newest measured joints."""
+        """Return the newest measured joint state."""
         return self._sample(deadline)
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:

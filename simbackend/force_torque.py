@@ -67,7 +67,7 @@ class SimForceTorque(SimDevice[Wrench]):
         )
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        """Newest raw wrench."""
+        """Return the newest raw wrench."""
         return self._sample(deadline)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[Wrench, Quality, Cause]:

@@ -49,7 +49,7 @@ class SimProximity(SimDevice[float]):
         )
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """Newest distance."""
+        """Return the newest distance."""
         return self._sample(deadline)
 
     def _tick_of(self, snapshot: Snapshot) -> int:

@@ -1,8 +1,8 @@
 """A six-axis arm of CiA-402 drives on CANopen: cyclic synchronous position, everything on SYNC (CiA 301, CiA 402-2).
 
-The owner thread sends all targets and then SYNC at a fixed rate; states come back on that SYNC, which stamps them. Each
-drive watches the host's heartbeat (1016h): when the host dies, they fault and brake by themselves. Nothing but `enable`
-switches them on.
+The owner thread sends all targets and then SYNC at a fixed rate; the drives' states are sampled on that SYNC, which
+gives their time stamp. Each drive monitors the host's heartbeat (1016h): if the host dies, the drives fault and brake
+on their own. Only `enable` switches them on.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ NMT, SYNC, RPDO1, HEARTBEAT = 0x000, 0x080, 0x200, 0x700
 START, PRE_OPERATIONAL = 0x01, 0x80
 OPERATIONAL, BOOT_UP = 5, 0
 IDLE_STATES = {4: "stopped", 0x7F: "pre-operational"}
-STARTS_S = 0.2  # after the order to start: older heartbeats may still be on their way
-CONNECT_S = 6.0  # seven objects of each of six drives
+STARTS_S = 0.2  # after the start command: older heartbeats may still be in transit
+CONNECT_S = 6.0  # seven objects for each of six drives
 MOVING_RAD_PER_S = 1e-3
-MOST_OWED = 4  # SYNCs that a drive may leave unanswered before it is waited for
-MOST_KNOWN = 64  # SYNCs whose time is kept
+MOST_OWED = 4  # unanswered SYNCs of one drive before the host waits for it
+MOST_KNOWN = 64  # number of SYNCs whose time is kept
 
 
 class Cia402Options(CanOptions):
@@ -58,7 +58,7 @@ class Cia402Options(CanOptions):
     kinematics: KinematicsOptions
 
     def known_arm(self) -> ArmCapabilities:
-        """Kinematics and limits as `kinematics` has them."""
+        """Return the kinematics and limits given by `kinematics`."""
         return capabilities(self.kinematics, command_rate_hz=self.rate_hz, watchdog_s=self.heartbeat_s)
 
     @model_validator(mode="after")
@@ -70,13 +70,13 @@ class Cia402Options(CanOptions):
 
     @property
     def stations(self) -> tuple[str, ...]:
-        """One node an axis."""
+        """Return one node id per axis."""
         return tuple(f"node {node}" for node in self.nodes)
 
 
 @dataclass(slots=True)
 class Axis:
-    """What is known of one drive; written by the owner thread alone."""
+    """Known state of one drive; only the owner thread writes it."""
 
     status: int | None = None
     increments: int = 0
@@ -86,7 +86,7 @@ class Axis:
 
     @property
     def state(self) -> DriveState:
-        """By its status word."""
+        """Return the state that the status word encodes."""
         return DriveState.NOT_READY if self.status is None else state_of(self.status)
 
     def __str__(self) -> str:
@@ -94,7 +94,7 @@ class Axis:
 
 
 class Cia402(StreamDevice[JointState]):
-    """The arm."""
+    """Six-axis arm of CiA-402 drives."""
 
     kind = DeviceKind.ARM
 
@@ -120,8 +120,8 @@ class Cia402(StreamDevice[JointState]):
         )
         self._axes = {node: Axis() for node in options.nodes}
         self._targets = dict.fromkeys(options.nodes, 0)
-        self._is_wanted = False  # operation enabled is wanted
-        self._is_reset = False  # a fault reset was asked for
+        self._is_wanted = False  # the drives should be in operation enabled
+        self._is_reset = False  # a fault reset has been requested
         self._commands = threading.RLock()
         self._started_s = self._next_sync_s = 0.0
         self._odd = ""
@@ -132,20 +132,20 @@ class Cia402(StreamDevice[JointState]):
         self.held_syncs = 0
 
     def capabilities(self) -> ArmCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         o = self._options
         return capabilities(o.kinematics, command_rate_hz=o.rate_hz, watchdog_s=o.heartbeat_s)
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Newest measured joints, all of one SYNC."""
+        """Return the newest measured joints, all sampled on one SYNC."""
         return self.newest(deadline)
 
     def enable(self, *, deadline: Deadline) -> None:
-        """Reset faults and lead all drives to operation enabled, with the measured position as target: no jump.
+        """Reset faults and bring all drives to operation enabled, with the measured position as target, so nothing jumps.
 
         Raises:
-            DeviceFault: a drive stays in fault. DeviceTimeout: it does not get there in time.
-            MotionRefused: stopped meanwhile.
+            DeviceFault: a drive stays in fault. DeviceTimeout: a drive is not enabled in time.
+            MotionRefused: a stop came meanwhile.
         """
         closings = self._filter.closings
         measured = self.newest(deadline).value.position_rad
@@ -162,8 +162,8 @@ class Cia402(StreamDevice[JointState]):
             rest.wait(0.5 / self._options.rate_hz)
         self._filter.begin(measured, closings=closings)
 
-    def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:  # noqa: ARG002  # nothing waits
-        """The targets of the next SYNC."""
+    def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:  # noqa: ARG002  # never waits
+        """Set the targets of the next SYNC; return them as limited."""
         self.require_open()
         with self._commands:
             if self._filter.is_open and not self._all_in(DriveState.OPERATION_ENABLED):
@@ -176,13 +176,13 @@ class Cia402(StreamDevice[JointState]):
     def _increments(self, position_rad: Array) -> dict[int, int]:
         return {node: round(q / self._rad) for node, q in zip(self._options.nodes, position_rad, strict=True)}
 
-    def stop(self, *, deadline: Deadline) -> None:  # noqa: ARG002  # nothing waits
-        """Quick stop of all drives with the next SYNC."""
+    def stop(self, *, deadline: Deadline) -> None:  # noqa: ARG002  # never waits
+        """Command a quick stop of all drives with the next SYNC."""
         self.require_open()
         self._switch_off()
 
     def start(self, link: Link) -> None:
-        """Open the channel, check and configure each drive, start them; motion stays off."""
+        """Open the channel, check and configure each drive, and start them; motion stays disabled."""
         o = self._options
         self._switch_off()
         self._codec = self._make_codec()
@@ -200,7 +200,7 @@ class Cia402(StreamDevice[JointState]):
         link.write(self._codec.encode(CanFrame(id_, data)), now_s() + self._answer_s)
 
     def keep_going(self, link: Link) -> float:
-        """Heartbeat, targets and SYNC when they are due."""
+        """Send heartbeat, targets and SYNC when they are due; return the time until the next, in seconds."""
         now = now_s()
         if now >= self._next_beat_s:
             self._next_beat_s = now + self._options.heartbeat_s / 4.0
@@ -210,7 +210,7 @@ class Cia402(StreamDevice[JointState]):
             late = int((now - self._next_sync_s) / period_s)
             self.missed_syncs += late
             self._next_sync_s += (late + 1) * period_s
-            self.take_in(link, 0.0)  # what lies ready answers earlier SYNCs
+            self.take_in(link, 0.0)  # data already received answers earlier SYNCs
             self._cycle(link)
         return max(0.0, min(self._next_sync_s, self._next_beat_s) - now_s())
 
@@ -223,7 +223,7 @@ class Cia402(StreamDevice[JointState]):
         now = now_s()
         probes = [frame for node, axis in self._axes.items() if (frame := self._probe(node, axis, now)) is not None]
         is_behind = any(axis.count.owed >= MOST_OWED or axis.count.needs_rest for axis in self._axes.values())
-        # More SYNCs would only queue up, and every answer would be older than the one before.
+        # Further SYNCs would only queue up and make every answer older than the last.
         batch = probes if is_behind else [*probes, *frames, CanFrame(SYNC, b"")]
         link.write(b"".join(self._codec.encode(frame) for frame in batch), now + self._answer_s)
         if is_behind:
@@ -235,7 +235,7 @@ class Cia402(StreamDevice[JointState]):
             axis.count.synced()
 
     def _probe(self, node: int, axis: Axis, now: float) -> CanFrame | None:
-        """A question whose answer tells late PDOs from lost ones, if any are owed."""
+        """Return an SDO request whose answer distinguishes late PDOs from lost ones, or None if no PDO is outstanding."""
         if not axis.count.wants_probe(now):
             return None
         axis.count.probed(now)
@@ -249,7 +249,7 @@ class Cia402(StreamDevice[JointState]):
         return towards_enabled(axis.state)
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Collect the states of one SYNC; mind emergencies and restarts."""
+        """Collect the states of one SYNC, and handle emergency messages and drive restarts."""
         for frame in self._codec.feed(chunk):
             node = frame.id & 0x7F
             axis = self._axes.get(node)
@@ -277,7 +277,7 @@ class Cia402(StreamDevice[JointState]):
                     self._heard_beat(node, frame.data[0] & 0x7F, arrived_s)
 
     def _heard_beat(self, node: int, state: int, arrived_s: float) -> None:
-        """A drive that is not operational sends no PDOs: to wait for them would only take longer."""
+        """Handle a heartbeat: a drive that is not operational sends no PDOs, so there is no point in waiting for them."""
         if state == BOOT_UP:
             self._set_up.forget(node)
             raise NoAnswer(f"node {node} has restarted")
@@ -285,13 +285,13 @@ class Cia402(StreamDevice[JointState]):
             raise NoAnswer(f"node {node} says that it is {IDLE_STATES[state]}")
 
     def wire_counts(self) -> str:
-        """As any stream's, and which drives leave SYNCs unanswered."""
+        """Return the stream's counters, and which drives leave SYNCs unanswered."""
         silent = ", ".join(str(node) for node, axis in self._axes.items() if axis.count.owed >= MOST_OWED)
         return super().wire_counts() + self._odd + (f"; nodes that answer no SYNC: {silent}" if silent else "")
 
     def _emergency(self, node: int, data: bytes) -> None:
         code = self._axes[node].emergency = data[0] | data[1] << 8
-        if code:  # 0000 says: error gone
+        if code:  # code 0000 means that the error is gone
             self._switch_off()
             self.fail(Refused(f"node {node} reports emergency {code:04X}h", code=code))
 
@@ -317,7 +317,7 @@ class Cia402(StreamDevice[JointState]):
         return all(axis.state is state for axis in self._axes.values())
 
     def _switch_off(self) -> None:
-        with self._commands:  # an `enable` that has looked whether it may must not want the drives on after this
+        with self._commands:  # an `enable` that has passed its check must not switch the drives on after this
             self._is_wanted = self._is_reset = False
             self._filter.close()
 
@@ -330,12 +330,12 @@ class Cia402(StreamDevice[JointState]):
         return DeviceTimeout(f"{self.name}: the drives do not follow ({states})", hint=hint, device=self.name)
 
     def lost(self, error: Exception) -> None:
-        """A lost bus takes the motion with it."""
+        """Stop the motion and report the loss of the bus."""
         self._switch_off()
         super().lost(error)
 
     def release(self) -> None:
-        """Quick stop for a cycle or two, then silence."""
+        """Command a quick stop for one or two cycles, then stop sending."""
         self._switch_off()
         threading.Event().wait(2.0 / self._options.rate_hz)
         super().release()

@@ -1,4 +1,4 @@
-"""Configures the drives of a CANopen arm by SDO, and goes on where a lost wire ended it (CiA 301, 7.2.4)."""
+"""Configures the drives of a CANopen arm by SDO, resuming where a lost link interrupted it (CiA 301, 7.2.4)."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from drivers.transport.link import Link, NoAnswer, Refused, now_s
 
 SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x580, 0x600, 0x700
 BOOT_UP = b"\x00"
-UPLOAD_SEGMENT, UPLOADED, DOWNLOADED, ABORTED = 0, 2, 3, 4  # first three bits of an answer
+UPLOAD_SEGMENT, UPLOADED, DOWNLOADED, ABORTED = 0, 2, 3, 4  # top three bits of an answer
 EXPEDITED, LAST, TOGGLE = 0x02, 0x01, 0x10
 MAPPINGS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60410010, 0x60640020)}
 CONSUMER, PRODUCER, MODE = 0x1016, 0x1017, 0x6060  # heartbeats and mode of operation
-# Objects that every configured drive has, asked in turn: so many that the answer to an old probe names another one.
+# Objects that every configured drive has, requested in turn, so that a late answer to an old probe names another object.
 PROBES = ((CONSUMER, 1), (PRODUCER, 0), (MODE, 0), *((index, sub) for index in MAPPINGS for sub in (1, 2)))
 CSP = 8
 SDO_S = 0.25
@@ -33,15 +33,15 @@ ABORTS = {
 
 
 def upload_request(index: int, sub: int) -> bytes:
-    """Expedited SDO read."""
+    """Return the request of an expedited SDO read."""
     return struct.pack("<BHB4x", 0x40, index, sub)
 
 
 class Objects(Protocol):
-    """Objects of drives, read and written."""
+    """Reads and writes objects of the drives."""
 
     def upload(self, node: int, index: int, sub: int) -> int:
-        """Value of an object, unsigned."""
+        """Return the value of an object, unsigned."""
         ...
 
     def download(self, node: int, index: int, sub: int, data: bytes) -> None:
@@ -50,14 +50,14 @@ class Objects(Protocol):
 
 
 class SdoClient:
-    """Transfers of up to four bytes; each is repeated by itself, as it names what it is about and changes nothing twice.
+    """SDO client for up to four bytes; each transfer is repeated on its own, which is safe because it names its object.
 
     Args:
-        answer_s: how long an answer is waited for.
-        restarted: is told which node has started again meanwhile.
+        answer_s: how long to wait for an answer.
+        restarted: called with the id of a node that has restarted meanwhile.
 
     Raises:
-        NoAnswer: nobody answers as that node. Refused: SDO abort.
+        NoAnswer: no answer from that node. Refused: SDO abort.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class SdoClient:
         self._restarted = restarted
 
     def upload(self, node: int, index: int, sub: int) -> int:
-        """Value of an object, unsigned."""
+        """Return the value of an object, unsigned."""
         answer = self._transfer(node, upload_request(index, sub), UPLOADED)
         if not answer[0] & EXPEDITED:
             return int.from_bytes(self._segments(node), "little")
@@ -82,7 +82,7 @@ class SdoClient:
         self._transfer(node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"), DOWNLOADED)
 
     def _segments(self, node: int) -> bytes:
-        """What a drive sends in pieces though it would fit into its first answer, as it may."""
+        """Return data that a drive sends in segments although it would fit into its first answer, which the standard allows."""
         data, toggle = b"", 0
         while True:
             answer = self._exchange(node, bytes([0x60 | toggle, *7 * [0]]), lambda a: a[0] >> 5 in (0, ABORTED))
@@ -125,14 +125,14 @@ class SdoClient:
 
 
 class SetUp:
-    """What every drive needs before it may run: our heartbeat watched, its own sent, CSP, and the PDO mappings we know.
+    """Configuration of every drive before it may run: heartbeat monitoring, its own heartbeat, CSP, and our PDO mappings.
 
-    A drive that was configured in an earlier attempt still has what we wrote to 1016h; one that was switched off since has
-    lost it and begins anew.
+    A drive configured in an earlier attempt still has the value that was written to 1016h; one that was power-cycled
+    since then has lost it and is configured from the start.
 
     Args:
-        consumer: value of 1016h:1, our node and how long it may be silent.
-        producer_ms: the drive's own heartbeat.
+        consumer: value of 1016h:1, the host's node id and its time-out.
+        producer_ms: period of the drive's own heartbeat.
     """
 
     def __init__(self, nodes: Iterable[int], *, consumer: int, producer_ms: int) -> None:
@@ -147,7 +147,7 @@ class SetUp:
         )
 
     def run(self, sdo: Objects) -> None:
-        """Bring all drives to the end of it."""
+        """Complete the configuration of all drives."""
         for node, done in self._done.items():
             if done and sdo.upload(node, CONSUMER, 1) != self._consumer:
                 self.forget(node)
@@ -157,7 +157,7 @@ class SetUp:
             self._done[node] += restarts == self._restarts
 
     def forget(self, node: int) -> None:
-        """The drive has started again, maybe while it was set up."""
+        """Restart the configuration of this node, because the drive has restarted."""
         if node in self._done:
             self._done[node] = 0
             self._restarts += 1

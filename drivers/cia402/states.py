@@ -1,4 +1,4 @@
-"""States of a CiA-402 drive: how the status word tells them and which control word leads on (CiA 402-2, 6.3)."""
+"""States of a CiA-402 drive: decoding of the status word, and the control word to the next state (CiA 402-2, 6.3)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class DriveState(StrEnum):
-    """The eight states."""
+    """The eight states of a CiA-402 drive."""
 
     NOT_READY = "not_ready"
     SWITCH_ON_DISABLED = "switch_on_disabled"
@@ -39,10 +39,10 @@ _TOWARDS_ENABLED = {
 
 
 def state_of(status_word: int) -> DriveState:
-    """The state that object 6041h tells; bits outside the masks do not matter."""
+    """Return the state encoded in object 6041h; bits outside the masks are ignored."""
     return next((state for state, mask, value in _PATTERNS if status_word & mask == value), DriveState.NOT_READY)
 
 
 def towards_enabled(state: DriveState) -> int:
-    """The control word for the next step to `operation_enabled`; a fault needs a reset, which must be asked for."""
+    """Return the control word for the next step to `operation_enabled`; a fault needs a separately requested reset."""
     return _TOWARDS_ENABLED.get(state, DISABLE)

@@ -1,22 +1,22 @@
-"""Which SYNC does a PDO answer? It does not say, so SYNCs and PDOs are counted."""
+"""Match PDOs to SYNCs by counting both, because a PDO does not say which SYNC it answers."""
 
 from __future__ import annotations
 
-PDOS = 2  # of a drive on each SYNC
-PROBE_S = 0.1  # a probe that was not answered for so long is lost
+PDOS = 2  # PDOs of a drive per SYNC
+PROBE_S = 0.1  # a probe unanswered for this long counts as lost
 
 
 class SyncCount:
-    """Counts what one drive owes.
+    """Counts the SYNCs that one drive has not answered yet.
 
-    A drive answers in order, so its next PDO belongs to the oldest SYNC that it has not answered. One that owes more may be
-    late or have lost some, and what it sends then is of no known SYNC. Which of the two, a probe tells: when an SDO that
-    was asked after those SYNCs has been answered, what has not come by then never will, and if nothing is missing by then,
-    nothing was lost. A drive whose PDOs overtake its SDO answers is found out by the first probe, and then only a probe
-    without any SYNC after it tells: such a drive `needs_rest` while it owes anything.
+    A drive answers in order, so its next PDO belongs to the oldest unanswered SYNC. If more than one SYNC is
+    unanswered, the answers may be late or lost, and a PDO cannot be assigned to a SYNC. A probe, an SDO request sent
+    after those SYNCs, decides: once it is answered, PDOs that are still missing will never come, and if none is
+    missing, none was lost. A drive whose PDOs overtake its SDO answers is detected by the first probe; from then on
+    only a probe with no SYNC after it is conclusive, so such a drive `needs_rest` while a SYNC is unanswered.
 
-    Its PDOs come in turn, so the same PDO with the same data twice running is one that was sent once and came twice. It is
-    not counted: among several that are owed it would pass for the answer to the next SYNC.
+    The PDOs of a drive alternate, so the same PDO with the same data twice in a row is a duplicate. It is not counted:
+    if several were outstanding, it would pass for the answer to the next SYNC.
     """
 
     def __init__(self) -> None:
@@ -32,31 +32,31 @@ class SyncCount:
 
     @property
     def answered(self) -> int | None:
-        """Number of the SYNC that all newest PDOs belong to; None when that is not known, or not one and the same."""
+        """Return the number of the SYNC that all newest PDOs belong to; None if unknown or not the same for all."""
         first = self._answered[0]
         return first if all(number == first for number in self._answered) else None
 
     @property
     def owed(self) -> int:
-        """SYNCs whose PDOs have not all come."""
+        """Return the number of SYNCs whose PDOs have not all arrived."""
         return max(self._owed)
 
     @property
     def needs_rest(self) -> bool:
-        """Is no SYNC to be sent before the next probe has been answered?"""
+        """Return whether no SYNC may be sent until the next probe has been answered."""
         return self._is_overtaking is True and any(self._owed)
 
     def synced(self) -> None:
-        """A SYNC has been sent; the first has number 1."""
+        """Count a SYNC that has been sent; the first has number 1."""
         self._sent += 1
         self._owed = [owed + 1 for owed in self._owed]
         if self._syncs_since_probe is not None:
             self._syncs_since_probe += 1
 
     def took(self, pdo: int, data: bytes) -> bool:
-        """PDO number `pdo` has come; tells whether it is a new one.
+        """Count a received PDO with number `pdo`; return whether it is new.
 
-        One that was not owed is a stray, and then it is not known which of the two is young; the same twice is no matter.
+        An unexpected PDO makes it unknown which of two is the newer one; a duplicate has no effect.
         """
         is_repeat = pdo == self._newest and data == self._last[pdo]
         self._newest = pdo
@@ -72,17 +72,20 @@ class SyncCount:
         return True
 
     def wants_probe(self, now_s: float) -> bool:
-        """Asked just before a SYNC: is something owed (or nothing known yet), and no probe on its way?"""
+        """Return whether to send a probe before the next SYNC: answers are outstanding or unknown, and no probe is pending."""
         is_on_its_way = self._syncs_since_probe is not None and now_s - self._probed_s < PROBE_S
         return (any(self._owed) or self._is_overtaking is None) and not is_on_its_way
 
     def probed(self, now_s: float) -> None:
-        """A probe has been sent; an earlier one no longer counts."""
+        """Record that a probe has been sent; an earlier one no longer counts."""
         self._syncs_since_probe, self._probed_s = 0, now_s
         self.probes += 1
 
     def probe_answered(self) -> None:
-        """Only the SYNCs since the probe are still owed; if just these are, what came before is what it was taken for."""
+        """Count only SYNCs since the probe as unanswered.
+
+        If exactly these were, the earlier assignment of PDOs was right.
+        """
         since = self._syncs_since_probe
         if since is None:
             return

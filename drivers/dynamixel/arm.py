@@ -1,7 +1,7 @@
-"""An arm of Dynamixel XM430 servos on one half-duplex bus (ROBOTIS e-Manual, protocol 2.0 and XM430-W350).
+"""Arm of Dynamixel XM430 servos on one half-duplex bus (ROBOTIS e-Manual, protocol 2.0 and XM430-W350).
 
-Torque comes on by `enable` alone and never by itself. Each servo's bus watchdog (98) is armed while torque is on: when
-the host falls silent it stops the servo and refuses goals until it is cleared.
+Only `enable` switches torque on. Each servo's bus watchdog (98) is armed while torque is on: if the host goes silent,
+the watchdog stops the servo, which then rejects goals until the watchdog is cleared.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class DynamixelOptions(BusOptions):
     kinematics: KinematicsOptions
 
     def known_arm(self) -> ArmCapabilities:
-        """Kinematics and limits as `kinematics` has them."""
+        """Return the kinematics and limits given by `kinematics`."""
         return capabilities(self.kinematics, command_rate_hz=self.rate_hz, watchdog_s=self.watchdog_s)
 
     @model_validator(mode="after")
@@ -73,12 +73,12 @@ class DynamixelOptions(BusOptions):
 
     @property
     def servos(self) -> tuple[int, ...]:
-        """One a joint."""
+        """Return one servo id per joint."""
         return self.ids
 
 
 class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
-    """The arm."""
+    """Arm of Dynamixel servos."""
 
     kind = DeviceKind.ARM
 
@@ -92,25 +92,25 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
         self._polls = 0
         self._is_fast = options.is_fast
-        self._modes: tuple[DynamixelClient | None, dict[int, int]] = (None, {})  # what a broken set-up has learned
-        self._pending: deque[dict[int, bytes]] = deque(maxlen=1)  # the newest goals, not yet sent
+        self._modes: tuple[DynamixelClient | None, dict[int, int]] = (None, {})  # modes read by an unfinished set-up
+        self._pending: deque[dict[int, bytes]] = deque(maxlen=1)  # newest goals, not sent yet
 
     def capabilities(self) -> ArmCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         o = self._options
         return capabilities(
             o.kinematics, command_rate_hz=o.rate_hz, watchdog_s=o.watchdog_s, resolution_rad=RAD_PER_COUNT
         )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Newest measured joints."""
+        """Return the newest measured joint state."""
         return self.newest(deadline)
 
     def enable(self, *, deadline: Deadline) -> None:
-        """Torque on with the measured position as goal; arms the bus watchdogs.
+        """Switch torque on with the measured position as goal, and arm the bus watchdogs.
 
         Raises:
-            MotionRefused: stopped meanwhile; the torque holds the arm where it is.
+            MotionRefused: a stop came meanwhile; torque holds the arm where it is.
         """
         closings = self._filter.closings
         measured = self.newest(deadline).value.position_rad
@@ -119,7 +119,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         self._filter.begin(measured, closings=closings)
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
-        """One goal for all servos in one packet; on a bus that stays busy it goes out before the next poll."""
+        """Send one goal for all servos in one packet; on a busy bus it goes out before the next poll."""
         self.require_open()
         sent = self._filter.passed(position_rad, now_s())
         self._pending.append(self._goals(sent))
@@ -127,7 +127,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         try:
             self.bus.call(self._send_pending, until_s)
         except NoAnswer:
-            return sent  # a servo that answers late must not end a motion
+            return sent  # a late answer of one servo must not end a motion
         except WireError as error:
             self.errors += 1
             raise self.translate(error) from error
@@ -138,7 +138,10 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
             client.sync_write(GOAL, 4, self._pending.pop(), until_s)
 
     def stop(self, *, deadline: Deadline) -> None:
-        """Hold where the arm is: torque stays on, so that it does not fall; goals are refused until `enable`."""
+        """Hold the present position: torque stays on so that the arm does not fall.
+
+        Goals are rejected until `enable`.
+        """
         self.require_open()
         was_open = self._filter.is_open
         self._filter.close()
@@ -148,7 +151,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
             self.call(lambda client, until_s: client.sync_write(GOAL, 4, here, until_s), deadline)
 
     def set_up(self, client: DynamixelClient) -> None:
-        """Each servo must answer; motion stays off until `enable`."""
+        """Check that each servo answers; motion stays disabled until `enable`."""
         self._filter.close()
         ids = self._options.ids
         client.sync_write(STATUS_RETURN, 1, dict.fromkeys(ids, ALWAYS), now_s() + self._options.timeout_s)
@@ -160,11 +163,11 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
                 raise Refused(f"servo {id_} is in mode {mode}, not {POSITION_MODE} (position)", code=mode, hint=hint)
 
     def _read_modes(self, client: DynamixelClient) -> dict[int, int]:
-        """Of all servos at once or, on a bad wire, one by one, going on where the attempt before ended."""
+        """Read the modes of all servos at once or, on a bad line, one by one, resuming where the last attempt ended."""
         o = self._options
         modes = self._modes[1] if self._modes[0] is client else {}
         for is_fast in (True, False) if o.is_fast and not modes else (False,) * (not modes):
-            self._is_fast = is_fast  # old firmware knows no fast reads: it is silent, or says so
+            self._is_fast = is_fast  # old firmware does not know fast reads: it stays silent or reports an error
             try:
                 blocks = self._read_all(client, MODE, 1, attempts=2 if is_fast else 6)
                 return {id_: block[0] for id_, block in blocks.items()}
@@ -189,7 +192,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         return ask(ids, address, length, until_s)
 
     def poll(self, client: DynamixelClient) -> None:
-        """Current, velocity and position of all servos."""
+        """Read current, velocity and position of all servos."""
         o = self._options
         self._send_pending(client, now_s() + o.timeout_s)
         with naming_alerts(client, o.ids, client.until_s(2 * len(o.ids), 2 * PACKET_BYTES)):
@@ -211,8 +214,11 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         )
 
     def _watch(self, client: DynamixelClient) -> None:
-        """A tripped watchdog refuses goals, and a servo without torque follows none, without a word: nobody answers a
-        sync write. A servo that has started again has neither torque nor a watchdog."""
+        """Check for tripped watchdogs and lost torque.
+
+        Sync writes are not acknowledged, so a servo with a tripped watchdog or without torque ignores goals silently.
+        A servo that has restarted has neither torque nor an armed watchdog.
+        """
         if self._polls % (2 * WATCH_EVERY):
             torque = self._read_all(client, TORQUE, 1)
             if limp := [id_ for id_, data in torque.items() if not data[0]]:
@@ -225,7 +231,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
             raise Refused(what, code=WATCHDOG_TRIPPED, hint="the bus was silent for too long; enable again")
 
     def fail(self, error: Exception) -> None:
-        """A servo's error report or a lost bus takes the motion with it."""
+        """Stop the motion after a servo's error report or the loss of the bus."""
         if not isinstance(error, NoAnswer | BadAnswer):
             self._filter.close()
         super().fail(error)
@@ -235,13 +241,13 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         for id_ in ids:
             if fault := client.hardware_error(id_, until_s):
                 raise Refused(f"servo {id_} reports {fault_text(fault)}", code=fault, hint=REBOOT)
-            client.write(id_, BUS_WATCHDOG, b"\x00", until_s)  # clears a tripped one
+            client.write(id_, BUS_WATCHDOG, b"\x00", until_s)  # clears a tripped watchdog
         client.sync_write(GOAL, 4, self._goals(measured), until_s)
         for id_ in ids:
             client.write(id_, TORQUE, b"\x01", until_s)
         ticks = max(1, min(127, round(self._options.watchdog_s / WATCHDOG_TICK_S)))
         idle = list(ids)
-        while idle:  # one by one, those that are armed already would wait for the last
+        while idle:  # all together: if armed one by one, the first would wait for the last
             client.sync_write(BUS_WATCHDOG, 1, dict.fromkeys(ids, bytes([ticks])), until_s)
             armed = self._read_all(client, BUS_WATCHDOG, 1, until_s=until_s)
             idle = [id_ for id_, data in armed.items() if data[0] != ticks]

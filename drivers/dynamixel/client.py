@@ -1,4 +1,4 @@
-"""The host's side of a Dynamixel 2.0 bus: requests, status packets, and none taken for the answer to another request."""
+"""Host side of a Dynamixel 2.0 bus: sends requests and assigns each status packet to the right request."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from drivers.transport.options import SerialOptions, serial_opener
 from hal.registry import Context
 from hal.wires import ResourceClaim
 
-QUARANTINE_S, LONGEST_QUARANTINE_S = 0.1, 0.8  # how long late answers are waited for; it doubles with each more lost
-DOUBT_S = 1.0  # an answer that is overtaken by others may come so late
+QUARANTINE_S, LONGEST_QUARANTINE_S = 0.1, 0.8  # wait for late answers; doubled with each further loss
+DOUBT_S = 1.0  # an answer overtaken by others may arrive this late
 HARDWARE_ERROR, STATUS_RETURN = 70, 68
-ALWAYS = b"\x02"  # status return: every instruction is answered
+ALWAYS = b"\x02"  # status return level: every instruction is answered
 PACKET_BYTES = 10  # header, id, length, instruction, CRC
 HARDWARE_BITS = {0: "supply voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
 REBOOT = "cure the cause, then switch the servo off and on: only a reboot helps"
@@ -31,21 +31,21 @@ PROBES = range(1, 13)  # lengths of a read from address 0, where no servo has ga
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What tells a status packet from others: id, bytes, and for a packet of several servos their order."""
+    """Identifies a status packet by id, length and, for a packet of several servos, their order."""
 
     id: int
     size: int
     order: tuple[int, ...] = ()
 
     def fits(self, packet: protocol.Packet) -> bool:
-        """Can this be the packet?"""
+        """Return whether the packet may be this one."""
         if (packet.id, len(packet.parameters)) != (self.id, self.size):
             return False
         return not self.order or tuple(packet.parameters[1 :: self.size // len(self.order)]) == self.order
 
 
 Shape = tuple[Part, ...]
-"""All packets of an answer."""
+"""Shape of an answer: the parts of all its packets."""
 
 
 class BusOptions(SerialOptions):
@@ -57,21 +57,22 @@ class BusOptions(SerialOptions):
     @property
     @abstractmethod
     def servos(self) -> tuple[int, ...]:
-        """Ids of the device's servos."""
+        """Return the ids of the device's servos."""
 
     def claim(self) -> ResourceClaim:
-        """Its servos, on a bus for many."""
+        """Claim the servos on a shared bus."""
         stations = tuple(f"servo {id_}" for id_ in self.servos)
         return ResourceClaim(wire=f"serial {self.port}", bus=f"Dynamixel 2.0 at {self.baud} baud", stations=stations)
 
 
 class DynamixelClient:
-    """Requests and status packets; what comes back must be from who was asked, in size and order.
+    """Sends requests and checks that each status packet comes from the right servo, with the right size and order.
 
-    A status packet does not tell what it answers, so no request is sent whose answer could be mistaken for a lost one's.
-    A block of all servos is asked for with its ids in another order each time. Other requests wait for the late answer, and if
-    it does not come, a block of a length that nobody waits for is read first: a bus answers in order, so what comes
-    after that answer is young. After two lost answers there is a pause, or a slow bus would never catch up.
+    A status packet does not say which request it answers, so no request is sent whose answer could be confused with a
+    lost one. A block of all servos is requested with the ids in a different order each time. Other requests wait for
+    the late answer; if it does not come, a block of a length that no lost answer has is read first: a bus answers in
+    order, so whatever follows that answer is new. After two lost answers there is a pause, or a slow bus would never
+    catch up.
     """
 
     def __init__(self, link: Link, *, timeout_s: float) -> None:
@@ -80,27 +81,27 @@ class DynamixelClient:
         self._fast_sizes: set[int] = set()
         self._framer = protocol.framer(self._fast_sizes)
         self._unanswered: list[Shape] = []  # oldest first
-        self._overtaken: deque[tuple[float, Shape]] = deque(maxlen=64)  # lost, and later ones were answered
+        self._overtaken: deque[tuple[float, Shape]] = deque(maxlen=64)  # lost, but later requests were answered
         self._lost_in_a_row = 0
         self._why = ""
         self._turn = 0
-        self.asked_s = 0.0  # when the last request left
+        self.asked_s = 0.0  # when the last request was sent
 
     def read(self, id_: int, address: int, length: int, until_s: float) -> bytes:
-        """A block of one servo."""
+        """Read a block of one servo."""
         return self._ask(protocol.read(id_, address, length), (id_,), length, until_s)[id_]
 
     def write(self, id_: int, address: int, data: bytes, until_s: float) -> None:
-        """A block of one servo, acknowledged."""
+        """Write a block of one servo and wait for the acknowledgement."""
         self._ask(protocol.write(id_, address, data), (id_,), 0, until_s)
 
     def sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
-        """The same block of all servos, one packet each."""
+        """Read the same block of all servos, one status packet each."""
         return self._ask(protocol.sync_read(address, length, ids), ids, length, until_s)
 
     def fast_sync_read(self, ids: tuple[int, ...], address: int, length: int, until_s: float) -> dict[int, bytes]:
-        """The same block of all servos in one packet."""
-        step = length + 4  # error, id, data, and a CRC over everything so far
+        """Read the same block of all servos in one status packet."""
+        step = length + 4  # error, id, data, and a running CRC
         self._fast_sizes.add(len(ids) * step)
 
         def request() -> tuple[bytes, Shape]:
@@ -117,16 +118,16 @@ class DynamixelClient:
         return {id_: blocks[id_][2 : 2 + length] for id_ in ids}
 
     def hardware_error(self, id_: int, until_s: float) -> int:
-        """What a servo gives as the cause of its alert."""
+        """Return the hardware error code, which is the cause of a servo's alert."""
         request = protocol.read(id_, HARDWARE_ERROR, 1)
         return self._exchange(lambda: (request, (Part(id_, 2),)), (id_,), until_s)[0].parameters[1]
 
     def until_s(self, attempts: int, answer_bytes: int) -> float:
-        """When so many attempts have had their time, with what the bytes take on the line."""
+        """Return when this many attempts will be over, including the time of the bytes on the line."""
         return now_s() + attempts * (self._timeout_s + answer_bytes * self._link.byte_s)
 
     def sync_write(self, address: int, length: int, values: dict[int, bytes], until_s: float) -> None:
-        """A block of each servo; nobody answers."""
+        """Write a block of each servo, without acknowledgement."""
         self._link.write(protocol.sync_write(address, length, values), until_s)
 
     def _ask(self, request: bytes, ids: tuple[int, ...], length: int, until_s: float) -> dict[int, bytes]:
@@ -139,7 +140,7 @@ class DynamixelClient:
     def _exchange(
         self, request: Callable[[], tuple[bytes, Shape]], ids: tuple[int, ...], until_s: float
     ) -> list[protocol.Packet]:
-        """Ask again after a lost answer while there is time."""
+        """Send a request and read its answer; ask again after a lost answer while time remains."""
         while True:
             try:
                 self._wait_for_late(until_s)
@@ -153,7 +154,7 @@ class DynamixelClient:
 
     def _attempt(self, request: bytes, shape: Shape, ids: tuple[int, ...], until_s: float) -> list[protocol.Packet]:
         self._note_late(self._packets(drain(self._link)))
-        self._framer.reset()  # what has begun and not ended by now is noise
+        self._framer.reset()  # an incomplete frame is noise by now
         self.asked_s = now_s()
         self._link.write(request, until_s)
         self._unanswered.append(shape)
@@ -162,7 +163,7 @@ class DynamixelClient:
         line_s = (len(request) + sum(part.size + PACKET_BYTES for part in shape)) * self._link.byte_s
         end_s = min(until_s, self.asked_s + self._timeout_s + line_s)
         while chunk := self._link.read(end_s):
-            end_s = min(until_s, max(end_s, now_s() + self._timeout_s))  # an answer in pieces is on its way
+            end_s = min(until_s, max(end_s, now_s() + self._timeout_s))  # the answer is arriving in pieces
             for packet in self._packets(chunk):
                 if shape[len(found)].fits(packet):
                     found.append(packet)
@@ -183,7 +184,7 @@ class DynamixelClient:
         raise NoAnswer(self._why)
 
     def _is_answered(self, shape: Shape) -> None:
-        """The bus answers in order: whatever was lost before will hardly come."""
+        """Record that this shape was answered: the bus answers in order, so earlier lost answers are unlikely to come."""
         self._overtaken += [(self.asked_s, lost) for lost in self._unanswered if lost != shape]
         self._unanswered.clear()
         self._lost_in_a_row = 0
@@ -192,17 +193,17 @@ class DynamixelClient:
         return any(set(shape) & set(lost) for lost in self._unanswered)
 
     def _doubted_since_s(self, shape: Shape) -> float:
-        """When an answer of this shape was last lost; never and long ago are the same."""
+        """Return when an answer of this shape was last lost: inf if still awaited, 0 if never or too long ago."""
         if self._is_awaited(shape):
             return math.inf
         lost_s = [then_s for then_s, lost in self._overtaken if set(shape) & set(lost)]
         return max([then_s for then_s in lost_s if now_s() - then_s < DOUBT_S], default=0.0)
 
     def _wait_for_late(self, until_s: float) -> None:
-        """Listen after a second lost answer, the longer the more were lost.
+        """Listen for late answers after a second loss, longer the more were lost.
 
         Raises:
-            NoAnswer: the pause is longer than the caller can wait.
+            NoAnswer: the pause exceeds the caller's time limit.
         """
         if self._lost_in_a_row < 2:
             return
@@ -215,14 +216,14 @@ class DynamixelClient:
                 raise NoAnswer(self._why)
 
     def _probe(self, id_: int, until_s: float) -> None:
-        """Ask what no lost answer fits, so that nothing can be mistaken after it.
+        """Send a request that no lost answer fits, so that later answers cannot be confused.
 
         Raises:
-            NoAnswer: the line is not known to be clean yet.
+            NoAnswer: the line is not known to be clear yet.
         """
         shapes = [(Part(id_, 1 + length),) for length in PROBES]
         free = [shape for shape in shapes if not self._is_awaited(shape)]
-        if not free:  # the servo is off, or so slow that it has to be let finish
+        if not free:  # the servo is off, or so slow that it must be given time
             drain_until_quiet(self._link, quiet_s=self._timeout_s + QUARANTINE_S, until_s=until_s)
             self._unanswered.clear()
             return
@@ -231,21 +232,21 @@ class DynamixelClient:
         self._unanswered.clear()
 
     def _note_late(self, packets: Iterable[protocol.Packet]) -> None:
-        """Answers to requests that were given up: neither they nor those before are waited for any longer."""
+        """Handle answers to abandoned requests: these and earlier requests are no longer waited for."""
         for packet in packets:
             fits = [i for i, lost in enumerate(self._unanswered) if lost[-1].fits(packet)]
             if fits:
                 del self._unanswered[: fits[0] + 1]
 
     def _packets(self, chunk: bytes) -> list[protocol.Packet]:
-        """Status packets; others are the echo of our own."""
+        """Return the status packets; other packets are the echo of our own."""
         packets = [_unpacked(frame) for frame in self._framer.feed(chunk)]
         return [packet for packet in packets if packet.instruction == protocol.STATUS]
 
 
 @contextmanager
 def naming_alerts(client: DynamixelClient, ids: tuple[int, ...], until_s: float) -> Iterator[None]:
-    """A hardware alert that comes up inside is raised again with its servo and cause."""
+    """Re-raise a hardware alert that occurs inside, naming its servo and cause."""
     try:
         yield
     except Refused as error:
@@ -257,12 +258,12 @@ def naming_alerts(client: DynamixelClient, ids: tuple[int, ...], until_s: float)
 
 
 def fault_text(fault: int) -> str:
-    """The bits of a hardware error in words."""
+    """Return the bits of a hardware error in words."""
     return ", ".join(text for bit, text in HARDWARE_BITS.items() if fault >> bit & 1) or f"hardware error {fault:02X}h"
 
 
 def dynamixel_bus(context: Context, options: BusOptions) -> Bus[DynamixelClient]:
-    """The bus of this port; devices that name the same port get the same one."""
+    """Return the bus of this port; devices that name the same port share one bus."""
     opener, name = serial_opener(options, context.name)
 
     def make() -> Bus[DynamixelClient]:
@@ -280,7 +281,7 @@ def _check(id_: int, error: int) -> None:
 
 
 def _unpacked(frame: bytes) -> protocol.Packet:
-    """Fast sync answers are not stuffed, so taking stuffing off could damage them."""
+    """Decode a frame; fast sync answers are not stuffed, so removing stuffing could damage them."""
     if frame[4] == protocol.BROADCAST and frame[7] == protocol.STATUS:
-        return protocol.Packet(frame[4], frame[7], frame[8:])  # with the last CRC, so that all blocks have one size
+        return protocol.Packet(frame[4], frame[7], frame[8:])  # with the last CRC: all blocks have one size
     return protocol.decode(frame)

@@ -1,7 +1,7 @@
-"""A two-finger gripper on a Dynamixel XM430 servo, beside an arm on the same bus or alone (XM430-W350 e-Manual).
+"""Two-finger gripper on a Dynamixel XM430 servo, beside an arm on the same bus or alone (XM430-W350 e-Manual).
 
-The servo works in current-based position mode: it goes to a position with at most the goal current, so the current is
-the grip. Torque comes on when the device is connected, and never again by itself.
+The servo works in current-based position mode: it moves to a position with at most the goal current, so the current
+sets the grip force. Torque is switched on when the device is connected, and never again automatically.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ A_PER_COUNT = 0.00269
 TURNS_PER_S_PER_COUNT = 0.229 / 60.0
 COUNTS_PER_TURN = 4096
 WATCHDOG_TICK_S = 0.02
-MOVING_COUNTS = 3  # of velocity: 0.7 rpm
+MOVING_COUNTS = 3  # velocity counts: 0.7 rpm
 AT_GOAL_COUNTS = 12
-HOLDING_PART = 0.5  # of the goal current, at rest and short of the goal
+HOLDING_PART = 0.5  # fraction of the goal current, at rest and short of the goal
 LIMIT_CURRENT = 1193
 CONNECT_S = 4.0
 
@@ -67,12 +67,12 @@ class GripperOptions(BusOptions):
 
     @property
     def servos(self) -> tuple[int, ...]:
-        """Its only one."""
+        """Return the id of the only servo."""
         return (self.id,)
 
 
 class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
-    """The gripper."""
+    """Two-finger gripper on a servo."""
 
     kind = DeviceKind.GRIPPER
 
@@ -85,18 +85,18 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         self._clock = (Unwrapper(bits=TICK_BITS, tick_s=TICK_S), HostTime())
 
     def capabilities(self) -> GripperCapabilities:
-        """From the options; the speed is the servo's own limit at 12 V."""
+        """Return the capabilities given by the options; the speed is the servo's own limit at 12 V."""
         o = self._options
         return GripperCapabilities(
             min_width_m=0.0, max_width_m=o.stroke_m, max_force_n=o.max_force_n, max_speed_m_per_s=self._speed(200)
         )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
-        """Newest width, and the grip as the motor's current tells it."""
+        """Return the newest width, and the grip derived from the motor current."""
         return self.newest(deadline)
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
-        """Start to move; returns the width that the nearest count stands for.
+        """Start a motion; return the width of the nearest count.
 
         Raises:
             InvalidRequest: not finite. DeviceFault: torque is off.
@@ -116,7 +116,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
                 raise DeviceFault(
                     f"{self.name} has no torque", hint="connect it again: that switches it on", device=self.name
                 )
-            client.write(o.id, WATCHDOG, b"\x00", until_s)  # a tripped one refuses goals
+            client.write(o.id, WATCHDOG, b"\x00", until_s)  # a tripped watchdog rejects goals
             client.write(o.id, GOAL_CURRENT, struct.pack("<h", current), until_s)
             client.write(o.id, PROFILE_VELOCITY, struct.pack("<I", velocity), until_s)
             client.write(o.id, GOAL, struct.pack("<i", goal), until_s)
@@ -127,7 +127,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         return self._width_m(goal)
 
     def activate(self, deadline: Deadline) -> None:
-        """Torque on, with the measured position as goal: nothing moves."""
+        """Switch torque on with the measured position as goal, so nothing moves."""
         o = self._options
 
         def work(client: DynamixelClient, until_s: float) -> None:
@@ -140,13 +140,13 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
             try:
                 self.call(work, deadline)
                 return
-            except (DeviceTimeout, DeviceUnavailable):  # a bad wire only makes it slower
+            except (DeviceTimeout, DeviceUnavailable):  # a bad line only makes this slower
                 if deadline.is_past():
                     raise
                 self.bus.rest(self.period_s)
 
     def set_up(self, client: DynamixelClient) -> None:
-        """The servo must answer, and be in the mode that limits its current; torque stays as it is."""
+        """Check that the servo answers and is in current-based position mode; torque stays as it is."""
         self._clock, o = (Unwrapper(bits=TICK_BITS, tick_s=TICK_S), HostTime()), self._options
         client.sync_write(STATUS_RETURN, 1, {o.id: ALWAYS}, now_s() + o.timeout_s)
         until_s = client.until_s(6, 2 * PACKET_BYTES)
@@ -160,7 +160,10 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         client.write(o.id, MODE, bytes([GRIP_MODE]), until_s)
 
     def poll(self, client: DynamixelClient) -> None:
-        """Clock, current, velocity and position in one block; the clock tells a late answer from a young one."""
+        """Read clock, current, velocity and position in one block.
+
+        The clock distinguishes a late answer from a new one.
+        """
         o = self._options
         until_s = client.until_s(2, BLOCK.size + 2 * PACKET_BYTES)
         with naming_alerts(client, (o.id,), client.until_s(3, 2 * PACKET_BYTES)):
@@ -184,7 +187,7 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         )
 
     def _speed(self, velocity: int) -> float:
-        """Metres a second of a profile velocity."""
+        """Return the speed of a profile velocity, in m/s."""
         o = self._options
         return velocity * TURNS_PER_S_PER_COUNT * COUNTS_PER_TURN * o.stroke_m / abs(o.open_count - o.closed_count)
 

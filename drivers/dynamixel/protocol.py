@@ -29,7 +29,7 @@ ERRORS = {
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A packet without stuffing: who, what, and what follows."""
+    """Packet without stuffing: id, instruction and parameters."""
 
     id: int
     instruction: int
@@ -37,27 +37,27 @@ class Packet:
 
 
 def encode(id_: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """A whole packet; length and CRC are taken after stuffing."""
+    """Return a complete packet; length and CRC are computed after stuffing."""
     body = (bytes([instruction]) + parameters).replace(STUFF, STUFFED)
     head = HEADER + bytes([id_]) + struct.pack("<H", len(body) + 2) + body
     return head + struct.pack("<H", crc_dynamixel(head))
 
 
 def decode(frame: bytes) -> Packet:
-    """The packet of a checked frame."""
+    """Return the packet of a checked frame."""
     body = frame[7:-2].replace(STUFFED, STUFF)
     return Packet(frame[4], body[0], body[1:])
 
 
 def framer(fast_sizes: Container[int] | None = None) -> Framer:
-    """Packets out of bytes: header, length in bounds, CRC.
+    """Return a framer for packets: header, length within bounds, CRC.
 
-    A header inside a packet is stuffed, so one that stands there begins another: the first was a false one, and does not
-    make true ones wait for the bytes that it promises. Answers to fast sync reads are not stuffed; of them the length is
+    A header inside a packet is stuffed, so an unstuffed one begins another packet: the first header was false, and the
+    framer does not wait for the rest of that frame. Answers to fast sync reads are not stuffed, so their length must be
     known.
 
     Args:
-        fast_sizes: how many bytes of parameters such an answer may have; any number unless given.
+        fast_sizes: possible parameter sizes of such an answer, in bytes; any size unless given.
     """
 
     def length(data: bytes) -> int | None:
@@ -74,27 +74,27 @@ def framer(fast_sizes: Container[int] | None = None) -> Framer:
 
 
 def sync_read(address: int, length: int, ids: Sequence[int], *, fast: bool = False) -> bytes:
-    """Read the same block of several servos."""
+    """Return a request that reads the same block from several servos."""
     instruction = FAST_SYNC_READ if fast else SYNC_READ
     return encode(BROADCAST, instruction, struct.pack("<HH", address, length) + bytes(ids))
 
 
 def sync_write(address: int, length: int, values: Mapping[int, bytes]) -> bytes:
-    """Write a block of each of several servos; nobody answers."""
+    """Return a request that writes a block to each of several servos, without acknowledgement."""
     items = b"".join(bytes([id_]) + data for id_, data in values.items())
     return encode(BROADCAST, SYNC_WRITE, struct.pack("<HH", address, length) + items)
 
 
 def bulk_read(items: Sequence[tuple[int, int, int]]) -> bytes:
-    """Read `(id, address, length)` of several servos."""
+    """Return a request that reads `(id, address, length)` from several servos."""
     return encode(BROADCAST, BULK_READ, b"".join(struct.pack("<BHH", *item) for item in items))
 
 
 def write(id_: int, address: int, data: bytes) -> bytes:
-    """Write a block of one servo."""
+    """Return a request that writes a block to one servo."""
     return encode(id_, WRITE, struct.pack("<H", address) + data)
 
 
 def read(id_: int, address: int, length: int) -> bytes:
-    """Read a block of one servo."""
+    """Return a request that reads a block from one servo."""
     return encode(id_, READ, struct.pack("<HH", address, length))

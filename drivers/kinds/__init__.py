@@ -1,1 +1,1 @@
-"""What devices of one kind share, whatever wire leads to them."""
+"""Code shared by devices of one kind, whatever link they use."""

@@ -1,4 +1,4 @@
-"""What wired arms share: kinematics from the options, and the checks that every set-point passes before it is sent."""
+"""Code shared by arm drivers: kinematics from the options, and the checks on every set-point before it is sent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hal.errors import InvalidRequest, MotionRefused
 from hal.strict import Strict
 
 Positive = Annotated[float, Field(gt=0)]
-STEP_MARGIN = 3.0  # set-points arrive in bunches on a busy host; a jump beyond this many periods is clipped
+STEP_MARGIN = 3.0  # set-points arrive in bunches on a busy host; jumps of more periods than this are clipped
 
 
 class LinkOptions(Strict):
@@ -51,17 +51,17 @@ class KinematicsOptions(Strict):
 
 
 def require_stations(what: str, stations: Sequence[int], k: KinematicsOptions) -> None:
-    """One station a joint, each a different one.
+    """Check that there is one station per joint and that all differ.
 
     Raises:
-        ValueError: it is not so; `what` is the key that lists them.
+        ValueError: the check fails; `what` is the key that lists the stations.
     """
     if len(stations) != len(k.links) or len(set(stations)) != len(stations):
         raise ValueError(f"{what} must be {len(k.links)} different ones, as kinematics has {len(k.links)} links")
 
 
 def kinematics_of(c: ArmCapabilities) -> dict[str, Any]:
-    """The options that describe an arm of another backend; emulators hand them to the driver."""
+    """Return the options that describe an arm of another backend; emulators pass them to the driver."""
     return {
         "model": c.model,
         "links": [{"d_m": x.d_m, "a_m": x.a_m, "alpha_rad": x.alpha_rad, "offset_rad": x.offset_rad} for x in c.links],
@@ -75,7 +75,7 @@ def kinematics_of(c: ArmCapabilities) -> dict[str, Any]:
 
 
 def ur10e() -> KinematicsOptions:
-    """The maker's published table of the UR10e; limits as delivered, radii rounded up."""
+    """Return the maker's published table of the UR10e, with the default limits and radii rounded up."""
     quarter = math.pi / 2.0
     rows = (
         (0.1807, 0.0, quarter),
@@ -100,7 +100,7 @@ def ur10e() -> KinematicsOptions:
 def capabilities(
     k: KinematicsOptions, *, command_rate_hz: float, watchdog_s: float | None, resolution_rad: float = 0.0
 ) -> ArmCapabilities:
-    """From the options."""
+    """Return the arm's capabilities from its kinematics options."""
     return ArmCapabilities(
         model=k.model,
         links=tuple(DhLink(d_m=x.d_m, a_m=x.a_m, alpha_rad=x.alpha_rad, offset_rad=x.offset_rad) for x in k.links),
@@ -117,10 +117,10 @@ def capabilities(
 
 
 class SetPointFilter:
-    """The last check before the drive: shape, finiteness, limits, and no jump from the last set-point.
+    """Final check of set-points: shape, finite values, limits, and no jump from the previous one.
 
-    Any thread may close it: a stop or a lost link does, while the control thread has a set-point in hand or is just
-    enabling the drives.
+    Any thread may close the filter, for example after a stop or a lost link, while the control thread is processing a
+    set-point or enabling the drives.
     """
 
     def __init__(self, name: str, k: KinematicsOptions, *, command_rate_hz: float) -> None:
@@ -135,11 +135,11 @@ class SetPointFilter:
 
     @property
     def closings(self) -> int:
-        """How often it was closed; who enables the drives looks before he begins."""
+        """Return how often the filter was closed; code that enables the drives reads this before it begins."""
         return self._closings
 
     def check_not_closed_since(self, closings: int) -> None:
-        """Raise `MotionRefused` when it was closed after `closings` was looked at."""
+        """Raise `MotionRefused` if the filter was closed after `closings` was read."""
         if self._closings != closings:
             raise MotionRefused(
                 f"{self._name}: stopped, or its link lost, while the drives were being enabled",
@@ -148,31 +148,31 @@ class SetPointFilter:
             )
 
     def begin(self, measured_rad: Array, *, closings: int) -> None:
-        """Set-points start from here.
+        """Open the filter with this position as the previous set-point.
 
         Args:
-            closings: as it was when the enabling began: a stop since then must win, or the arm would move after it.
+            closings: value when the enabling began: a stop since then takes precedence, or the arm would move after it.
 
         Raises:
-            MotionRefused: closed meanwhile.
+            MotionRefused: the filter was closed meanwhile.
         """
         with self._passing:
             self.check_not_closed_since(closings)
             self._last = measured_rad
 
     def close(self) -> None:
-        """Refuse all set-points, also those of an enabling that has begun."""
+        """Reject all set-points, including those of an enabling in progress."""
         with self._passing:
             self._last = None
             self._closings += 1
 
     @property
     def is_open(self) -> bool:
-        """May set-points pass?"""
+        """Return whether set-points may pass."""
         return self._last is not None
 
     def passed(self, wanted_rad: Array, now_s: float) -> Array:
-        """The set-point as it may be sent.
+        """Return the set-point clipped to what may be sent.
 
         Raises:
             InvalidRequest: wrong shape or not finite. MotionRefused: not enabled.

@@ -1,4 +1,4 @@
-"""What cameras share: a nominal lens, and OpenCV's picture as the bytes that an `Image` holds."""
+"""Code shared by cameras: a nominal lens, and conversion of OpenCV pictures to the pixels of an `Image`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class LensOptions(Strict):
 
 
 def nominal(width_px: int, height_px: int, lens: LensOptions) -> CameraIntrinsics:
-    """The options' lens, or one of 53 degrees across, centred."""
+    """Return the lens of the options, or a centred one with a 53 degree horizontal field of view."""
     fx_px = lens.fx_px or float(width_px)
     return CameraIntrinsics(
         width_px=width_px,
@@ -36,7 +36,7 @@ def nominal(width_px: int, height_px: int, lens: LensOptions) -> CameraIntrinsic
 
 
 def to_pixels(bgr: NDArray[Any], *, is_colour: bool) -> Pixels:
-    """OpenCV's picture as RGB or gray bytes."""
+    """Return OpenCV's picture as RGB or grey bytes."""
     if bgr.ndim == 2:
         bgr = cv2.cvtColor(bgr, cv2.COLOR_GRAY2BGR)
     code = cv2.COLOR_BGR2RGB if is_colour else cv2.COLOR_BGR2GRAY

@@ -1,4 +1,4 @@
-"""Lights and pads on digital points, whatever wire leads to them: one point each, and a checked command."""
+"""Code shared by lights and touch pads on digital inputs and outputs: option checks and command checks."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from hal.errors import InvalidRequest
 
 
 def require_same_number(what: str, *lists: Sequence[object] | None) -> None:
-    """All lists that are given have the same number of entries, at least one.
+    """Check that all lists given have the same number of entries, at least one.
 
     Raises:
-        ValueError: they have not; `what` names their keys.
+        ValueError: they do not; `what` names their keys.
     """
     counts = {len(entries) for entries in lists if entries is not None}
     if len(counts) != 1 or 0 in counts:
@@ -19,10 +19,10 @@ def require_same_number(what: str, *lists: Sequence[object] | None) -> None:
 
 
 def wanted_lights(device: str, channels: Sequence[str], on: Sequence[bool]) -> tuple[bool, ...]:
-    """What to switch, one value a light.
+    """Return the commanded states, one value per light.
 
     Raises:
-        InvalidRequest: another number of values.
+        InvalidRequest: the number of values differs from the number of lights.
     """
     if len(on) == len(channels):
         return tuple(bool(value) for value in on)

@@ -1,4 +1,4 @@
-"""What cameras and range scanners made of files share: one file a period, to whoever asks for the next."""
+"""Code shared by cameras and range scanners that play files: each read returns the next file, one per period."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 class FilePlayer(WireDevice[T]):
-    """Plays files, one a period, and holds its breath between them."""
+    """Plays files, at most one per period, and waits between them."""
 
     def __init__(self, context: Context, path: Path, *, rate_hz: float) -> None:
         super().__init__(context, max_age_s=3.0 / rate_hz)
@@ -30,14 +30,14 @@ class FilePlayer(WireDevice[T]):
 
     @abstractmethod
     def show(self, index: int, shown_s: float) -> None:
-        """Load file number `index`, counted on and on, and publish it as of `shown_s` (links' clock).
+        """Load file number `index`, which increases without end, and publish it as of `shown_s` (links' clock).
 
         Raises:
-            DeviceFault: it is damaged. DeviceUnavailable: there are no more.
+            DeviceFault: the file is damaged. DeviceUnavailable: there are no more files.
         """
 
     def play(self, deadline: Deadline) -> Stamped[T]:
-        """The next file, not before its period has come.
+        """Return the next file's content, not before its period has elapsed.
 
         Raises:
             DeviceTimeout: the deadline ends before the period. DeviceFault, DeviceUnavailable: see `show`.
@@ -61,17 +61,17 @@ class FilePlayer(WireDevice[T]):
             self._turn.release()
 
     def release(self) -> None:
-        """End a wait."""
+        """End a wait in progress."""
         self._closing.set()
 
     def is_up(self) -> bool:
-        """Files stay."""
+        """Return True: files do not disconnect."""
         return True
 
     def reconnects(self) -> int:
-        """Never."""
+        """Return 0: files do not reconnect."""
         return 0
 
     def link_name(self) -> str:
-        """The path."""
+        """Return `files` and the path."""
         return f"files {self._path}"

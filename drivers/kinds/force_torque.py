@@ -1,4 +1,4 @@
-"""What wrench sensors share: their measuring range as options, and what they say of themselves."""
+"""Code shared by force/torque sensors: the measuring range as options, and the capabilities derived from it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RangeOptions(Strict):
 
 
 def capabilities(options: RangeOptions, rate_hz: float) -> ForceTorqueCapabilities:
-    """From the options."""
+    """Return the capabilities given by the options."""
     return ForceTorqueCapabilities(
         force_range_n=options.force_range_n,
         torque_range_nm=options.torque_range_nm,

@@ -1,4 +1,4 @@
-"""What line scanners share: one row of beams in a plane, as a range image one pixel high, kept during a sweep."""
+"""Code shared by line scanners: one row of beams in a plane, as a range image one pixel high, recorded during a sweep."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 
-MOST_KEPT = 4000  # scans of one sweep: 50 s of the fastest scanner
+MOST_KEPT = 4000  # scans kept per sweep: 50 s of the fastest scanner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Beams:
-    """Geometry of a line scanner as it reports it itself."""
+    """Geometry of a line scanner, as reported by the device."""
 
     count: int
     first_rad: float
@@ -31,7 +31,7 @@ class Beams:
 
 
 class LineScanner(StreamDevice[RangeImage]):
-    """A scanner that streams lines; the subclass parses them and knows its `beams` once it is set up."""
+    """Scanner that streams lines; the subclass parses them and sets `beams` during set-up."""
 
     kind = DeviceKind.RANGE_SCANNER
     beams: Beams | None = None
@@ -39,10 +39,10 @@ class LineScanner(StreamDevice[RangeImage]):
     _kept: deque[Stamped[RangeImage]] | None = None
 
     def capabilities(self) -> RangeScannerCapabilities:
-        """As the device reported at its last set-up.
+        """Return the geometry that the device reported at its last set-up.
 
         Raises:
-            DeviceUnavailable: it has not been set up yet.
+            DeviceUnavailable: the device has not been set up yet.
         """
         b = self.beams
         if b is None:
@@ -64,20 +64,20 @@ class LineScanner(StreamDevice[RangeImage]):
         )
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
-        """A scan that began after this call: its end is at least one turn away."""
+        """Return a scan that began after this call, so it ends at least one turn later."""
         scan_s = self.beams.scan_s if self.beams is not None else 0.0
         return self.newest(deadline, not_before_s=self.context.clock.now_s() + scan_s)
 
     def start_recording(self, *, deadline: Deadline) -> None:
         """Keep every scan that ends from now on, at most the newest 4000."""
-        self.newest(deadline)  # a scanner that is silent now is told before the arm moves
+        self.newest(deadline)  # a silent scanner is reported before the arm moves
         self._kept = deque(maxlen=MOST_KEPT)
 
     def end_recording(self, *, deadline: Deadline) -> tuple[Stamped[RangeImage], ...]:
-        """The scans since `start_recording`, oldest first.
+        """Return the scans since `start_recording`, oldest first.
 
         Raises:
-            DeviceTimeout, DeviceUnavailable, DeviceFault: the scanner has failed meanwhile.
+            DeviceTimeout, DeviceUnavailable, DeviceFault: the scanner failed meanwhile.
         """
         self.newest(deadline)
         kept, self._kept = self._kept, None
@@ -92,10 +92,10 @@ class LineScanner(StreamDevice[RangeImage]):
         missed: int = 0,
         quality: Quality = Quality.VALID,
     ) -> None:
-        """Put one scan, beam by beam, NaN where nothing was seen; `valid_s` is its end.
+        """Publish one scan, beam by beam, NaN where nothing was seen; `valid_s` is the time of its end.
 
         Args:
-            quality: what the device itself says of it; a scan that saw nothing is invalid in any case.
+            quality: as reported by the device; a scan in which no beam saw anything is always invalid.
         """
         cause = Cause.NONE if quality is Quality.VALID else Cause.DEVICE
         if not np.any(np.isfinite(range_m)) and quality is not Quality.INVALID:
@@ -114,5 +114,5 @@ class LineScanner(StreamDevice[RangeImage]):
 
 
 def within(range_m: Array, beams: Beams) -> Array:
-    """Ranges with everything outside the sensor's limits as NaN."""
+    """Return the ranges, with values outside the sensor's limits as NaN."""
     return np.where((range_m >= beams.min_range_m) & (range_m <= beams.max_range_m), range_m, math.nan)

@@ -1,1 +1,1 @@
-"""Slamtec RPLIDAR: the scanner, and its express scans."""
+"""Slamtec RPLIDAR: the scanner driver, and the decoding of express scans."""

@@ -1,7 +1,7 @@
-"""Express scans of the RPLIDAR: capsules of 32 measurements under an exclusive or (Slamtec interface protocol, LR001).
+"""Express scans of the RPLIDAR: capsules of 32 measurements with an XOR checksum (Slamtec interface protocol, LR001).
 
-A capsule says at which angle it starts; its measurements are spread evenly up to the start of the next one, each moved
-back by an offset of its own. So a capsule can be decoded only when its successor has come.
+A capsule states its start angle; its measurements are spread evenly up to the start of the next capsule, each minus an
+offset of its own. A capsule can therefore be decoded only after the next one has arrived.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ REQUEST_BODY = bytes([0xA5, EXPRESS_SCAN, 5, 0, 0, 0, 0, 0])
 REQUEST = REQUEST_BODY + bytes([xor_byte(REQUEST_BODY)])
 CAPSULE_BYTES, POINTS = 84, 32
 CABIN = np.dtype([("d1", "<u2"), ("d2", "<u2"), ("offsets", "u1")])
-UNEVEN = 0.3  # part by which the angles of two neighbours may differ: a motor's speed changes slowly
+UNEVEN = 0.3  # fraction by which the spans of neighbours may differ: a motor's speed changes slowly
 NO_RANGE = math.nan
 Points = tuple[Array, Array]
 
 
 def is_capsule(data: bytes) -> bool:
-    """Do sync nibbles and exclusive or of these 84 bytes fit?"""
+    """Return whether the sync nibbles and the XOR checksum of these 84 bytes are right."""
     return data[0] >> 4 == 0xA and data[1] >> 4 == 0x5 and (data[0] & 15 | (data[1] & 15) << 4) == xor_byte(data[2:])
 
 
 def start_rad(capsule: bytes) -> float:
-    """Angle of its first measurement, before the offset."""
+    """Return the angle of the first measurement, before its offset."""
     return math.radians((struct.unpack_from("<H", capsule, 2)[0] & 0x7FFF) / 64.0)
 
 
 def is_first(capsule: bytes) -> bool:
-    """Did the scan begin anew with it?"""
+    """Return whether a new scan begins with this capsule."""
     return bool(capsule[3] & 0x80)
 
 
 def decode_capsule(capsule: bytes, next_start_rad: float) -> Points:
-    """Angles in radians within one turn and distances in metres (NaN for none) of a capsule's 32 measurements:
+    """Return angles in radians within one turn, and distances in metres (NaN for none), of the 32 measurements.
 
     angle_k = start + k / 32 (next start - start) - offset_k.
     """
@@ -56,7 +56,7 @@ def decode_capsule(capsule: bytes, next_start_rad: float) -> Points:
 
 
 class CapsuleParser:
-    """Measurements out of bytes in any chunks; `None` in the result stands for lost bytes."""
+    """Parses measurements from bytes in chunks of any size; `None` in the result marks lost bytes."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -65,7 +65,7 @@ class CapsuleParser:
         self.missteps = 0
 
     def feed(self, chunk: bytes) -> list[Points | None]:
-        """The measurements of each capsule whose successor has come."""
+        """Return the measurements of each capsule whose successor has arrived."""
         data, at, found = self._buffer + chunk, 0, list[Points | None]()
         while at + CAPSULE_BYTES <= len(data):
             capsule = data[at : at + CAPSULE_BYTES]
@@ -80,11 +80,11 @@ class CapsuleParser:
 
     @property
     def pending(self) -> int:
-        """Measurements that wait for the next capsule."""
+        """Return the number of measurements that wait for the next capsule."""
         return 0 if self._before is None else POINTS
 
     def _follow(self, capsule: bytes) -> list[Points | None]:
-        """What the arrival of a capsule tells of the one before; capsules of unequal span are no neighbours."""
+        """Decode the previous capsule from the arrival of this one; capsules of unequal span are not neighbours."""
         before, self._before = self._before, capsule
         if before is None or is_first(capsule):
             self._span_rad = None
@@ -104,10 +104,10 @@ class CapsuleParser:
 
 
 def split_turns(angle_rad: Array, last_rad: float) -> list[int]:
-    """Places where a new turn begins: the angle falls by more than half a turn.
+    """Return the indices where a new turn begins: the angle falls by more than half a turn.
 
     Args:
-        last_rad: the angle before the first.
+        last_rad: the angle before the first one, in radians.
     """
     fall_rad = -np.diff(angle_rad, prepend=last_rad)
     return [int(place) for place in np.flatnonzero(fall_rad > math.pi)]

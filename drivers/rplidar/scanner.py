@@ -1,8 +1,8 @@
 """Slamtec RPLIDAR A1/A2 over serial, standard and express scans (Slamtec interface protocol, LR001).
 
-In a standard scan a measurement has five bytes and no check sum: a start bit beside its inverse and a bit that is always
-1. So nothing is believed until eight measurements after it are in step, and a turn with a misstep in it is thrown away
-whole.
+A measurement of a standard scan has five bytes and no checksum, only a start bit next to its inverse and one bit that
+is always 1. A measurement is therefore accepted only when the next eight are in step too, and a turn with a misstep in
+it is discarded as a whole.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from hal.registry import Context, takes
 STOP, RESET, START_SCAN, GET_INFO, GET_HEALTH = 0x25, 0x40, 0x20, 0x50, 0x52
 INFO_TYPE, HEALTH_TYPE, SCAN_TYPE = 0x04, 0x06, 0x81
 NODE_BYTES = 5
-IN_STEP = 8  # a shifted stream passes the test of one measurement with probability 1/4, of eight with 1/65536
+IN_STEP = 8  # a shifted stream passes one test with probability 1/4, eight with 1/65536
 FULL_TURN_Q6 = 360 * 64
-WHOLE_TURN_RAD = math.radians(330)  # a turn that lost its beginning is not published as one
+WHOLE_TURN_RAD = math.radians(330)  # a turn that lost its beginning is not published
 JITTER_RAD = math.radians(2.0)
 WARNING, ERROR = 1, 2
-ANSWER_S = (0.3, 0.6, 0.9)  # of each attempt: a slow scanner catches up with what it was asked again
+ANSWER_S = (0.3, 0.6, 0.9)  # of each attempt: a slow scanner catches up on repeated requests
 RESET_S = 0.5
 SPIN_UP_S = 2.5  # before the first measurement
-TURN_S = 3.0  # measurements, but no whole turn for so long
+TURN_S = 3.0  # restart when measurements arrive but no whole turn for this long
 CONNECT_S = 6.0
 SEND_S, QUIET_S = 0.3, 0.3
 OLD_FIRMWARE = '; the first A1 models know no express scans: set mode = "standard"'
@@ -57,12 +57,12 @@ class RplidarOptions(SerialOptions):
 
 
 def descriptor(length: int, mode: int, kind: int) -> bytes:
-    """`A5 5A`, 30 bits of length and 2 of mode, type."""
+    """Return the descriptor: `A5 5A`, 30 bits of length and 2 of mode, type."""
     return struct.pack("<BBIB", 0xA5, 0x5A, length | mode << 30, kind)
 
 
 def begins_node(data: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """For every place in `data` but the last four: does what stands there look like a measurement?"""
+    """Return, for every index in `data` except the last four, whether a plausible measurement begins there."""
     start, check = data[:-4] & 3, data[1:-3] & 1
     angle_q6 = data[1:-3].astype(np.int32) >> 1 | data[2:-2].astype(np.int32) << 7
     is_good: NDArray[np.bool_] = ((start == 1) | (start == 2)) & (check == 1) & (angle_q6 <= FULL_TURN_Q6)
@@ -70,7 +70,7 @@ def begins_node(data: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def decode(nodes: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Start flags, angles in radians, distances in metres (NaN for none) of (n, 5) measurements."""
+    """Return start flags, angles in radians and distances in metres (NaN for none) of (n, 5) measurements."""
     n = nodes.astype(np.int32)
     angle_rad = np.radians((n[:, 1] >> 1 | n[:, 2] << 7) / 64.0)
     distance_m = (n[:, 3] | n[:, 4] << 8) / 4000.0
@@ -78,7 +78,7 @@ def decode(nodes: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], Array, Array]:
 
 
 class NodeParser:
-    """Measurements out of bytes in any chunks; `None` in the result stands for a misstep."""
+    """Parses measurements from bytes in chunks of any size; `None` in the result marks a misstep."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -86,7 +86,7 @@ class NodeParser:
         self.missteps = 0
 
     def feed(self, chunk: bytes) -> list[NDArray[np.uint8] | None]:
-        """Runs of (n, 5) measurements that are trusted now, parted by missteps."""
+        """Return runs of (n, 5) measurements that are now confirmed, separated by missteps."""
         self._buffer += chunk
         runs: list[NDArray[np.uint8] | None] = []
         if len(self._buffer) < NODE_BYTES * (IN_STEP + 1):
@@ -103,7 +103,7 @@ class NodeParser:
                 runs.append(data[at : at + trusted * NODE_BYTES].reshape(-1, NODE_BYTES))
                 at += trusted * NODE_BYTES
             if length == len(steps):
-                break  # in step up to the end, but the last few cannot be trusted yet
+                break  # in step up to the end, but the last few are not confirmed yet
             if self._is_in_step:
                 self.missteps += 1
                 runs.append(None)
@@ -114,14 +114,14 @@ class NodeParser:
 
     @property
     def pending(self) -> int:
-        """Measurements that have come and are not trusted yet."""
+        """Return the number of measurements received but not yet confirmed."""
         return len(self._buffer) // NODE_BYTES
 
 
 def _next_in_step(good: NDArray[np.bool_], at: int) -> int:
-    """The first place from `at` on from where everything known is in step for as long as it takes to trust it."""
+    """Return the first index from `at` on after which all known bytes stay in step for the confirmation length."""
     span = NODE_BYTES * IN_STEP
-    padded = np.concatenate((good[at:], np.ones(span, np.bool_)))  # what has not come yet may still be good
+    padded = np.concatenate((good[at:], np.ones(span, np.bool_)))  # bytes yet to come may still be good
     ok = padded[: len(good) - at].copy()
     for k in range(1, IN_STEP + 1):
         ok &= padded[k * NODE_BYTES : k * NODE_BYTES + len(ok)]
@@ -130,7 +130,7 @@ def _next_in_step(good: NDArray[np.bool_], at: int) -> int:
 
 
 class Rplidar(LineScanner):
-    """A Slamtec scanner."""
+    """Slamtec RPLIDAR scanner."""
 
     def __init__(self, context: Context, options: RplidarOptions) -> None:
         opener, name = serial_opener(options, context.name)
@@ -151,7 +151,7 @@ class Rplidar(LineScanner):
         self._nodes, self._capsules = NodeParser(), CapsuleParser()
         self._turn: list[Points] | None = None
         self._turn_s = now_s()
-        # The turn: when its first chunk came, and what came in that with it.
+        # The present turn: arrival time of its first chunk, and the number of measurements in that chunk.
         self._begun: tuple[float, int] | None = None
         self._measurement_s = 0.0
         self._last_rad = 0.0
@@ -159,14 +159,14 @@ class Rplidar(LineScanner):
         self._quality = Quality.VALID
 
     def set_up(self, link: Link) -> None:
-        """As any stream's, and then the motor may have to spin up."""
+        """Set up as any stream, then allow time for the motor to spin up."""
         super().set_up(link)
         self._heard_s += SPIN_UP_S
 
     def start(self, link: Link) -> None:
-        """Start the motor, stop, identify, ask for its health (one reset if it is ill), scan."""
+        """Start the motor, stop scanning, identify, check the health (with one reset if bad), and start the scan."""
         if (line := inside(link, SerialLink)) is not None:
-            line.set_dtr(False)  # an A1's motor turns while DTR is low
+            line.set_dtr(False)  # the motor of an A1 turns while DTR is low
         link.write(bytes([0xA5, STOP]), now_s() + SEND_S)
         drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + QUIET_S)
         self._ask(link, bytes([0xA5, GET_INFO]), descriptor(20, 0, INFO_TYPE), 20)
@@ -187,12 +187,12 @@ class Rplidar(LineScanner):
         self.receive(rest, now_s())
 
     def _health(self, link: Link) -> tuple[int, int]:
-        """Status and error code."""
+        """Return health status and error code."""
         answer = self._ask(link, bytes([0xA5, GET_HEALTH]), descriptor(3, 0, HEALTH_TYPE), 3)
         return answer[0], answer[1] | answer[2] << 8
 
     def _ask(self, link: Link, request: bytes, head: bytes, length: int, remedy: str = "") -> bytes:
-        """What follows the descriptor `head`: at least `length` bytes."""
+        """Return what follows the descriptor `head`: at least `length` bytes."""
         for answer_s in ANSWER_S:
             link.write(request, now_s() + SEND_S)
             seen, until_s = b"", now_s() + answer_s
@@ -204,7 +204,7 @@ class Rplidar(LineScanner):
         raise NoAnswer(f"no answer to command {request[1]:02X}h{remedy}")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Collect measurements; a start flag, or an angle that falls back to nought, ends a turn."""
+        """Collect measurements; a start flag, or an angle that falls back to zero, ends a turn."""
         batches: list[Any] = (
             list(self._capsules.feed(chunk)) if self._is_express else [_points(run) for run in self._nodes.feed(chunk)]
         )
@@ -233,11 +233,11 @@ class Rplidar(LineScanner):
         return starts
 
     def _finish(self, arrived_s: float, behind: int) -> None:
-        """Publish the turn.
+        """Publish the completed turn.
 
         Args:
-            arrived_s: when the chunk came.
-            behind: measurements since the end of the turn, each of which took as long as those of the turn.
+            arrived_s: when the chunk arrived.
+            behind: measurements since the end of the turn, assumed to take as long as those of the turn.
         """
         begun, self._begun = self._begun, (arrived_s, behind)
         if not self._turn or begun is None or self.beams is None:
@@ -248,7 +248,7 @@ class Rplidar(LineScanner):
             return
         missed, self._missed = self._missed, 0
         between = len(angle_rad) + behind - begun[1]  # measurements between the two arrivals
-        if between > len(angle_rad) / 2:  # of fewer, the jitter of the arrivals would be all
+        if between > len(angle_rad) / 2:  # with fewer, the jitter of the arrivals would dominate
             self._measurement_s = (arrived_s - begun[0]) / between
         each_s = self._measurement_s or self.beams.scan_s / len(angle_rad)
         self._turn_s = max(self._turn_s, arrived_s)
@@ -263,7 +263,7 @@ class Rplidar(LineScanner):
 def _points(
     run: NDArray[np.uint8] | None,
 ) -> tuple[list[int], Array, Array] | None:
-    """Places of start flags, angles and distances of a run of measurements."""
+    """Return the indices of start flags, the angles and the distances of a run of measurements."""
     if run is None:
         return None
     is_start, angle_rad, distance_m = decode(run)
@@ -271,13 +271,13 @@ def _points(
 
 
 def turns_back(angle_rad: Array) -> bool:
-    """Does an angle go back by more than the motor's jitter? Noise that looks like a measurement makes it."""
+    """Return whether an angle goes back by more than the motor's jitter, as noise taken for a measurement does."""
     step_rad = (np.diff(angle_rad) + np.pi) % math.tau - np.pi
     return bool(np.any(step_rad < -JITTER_RAD))
 
 
 def sectors(angle_rad: Array, range_m: Array, count: int) -> Array:
-    """The nearest range in each of `count` sectors centred on multiples of the step; NaN in empty ones."""
+    """Return the nearest range in each of `count` sectors centred on multiples of the step; NaN in empty ones."""
     seen = np.isfinite(range_m)
     sector = np.round(angle_rad[seen] * (count / math.tau)).astype(np.int64) % count
     nearest = np.full(count, math.inf)

@@ -1,1 +1,1 @@
-"""A Universal Robots controller over RTDE: the arm, its digital inputs and outputs, and the session that both hold."""
+"""Universal Robots controller over RTDE: the arm, the digital inputs and outputs, and the session that both use."""

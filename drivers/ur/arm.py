@@ -1,7 +1,7 @@
-"""Universal Robots arm: state over RTDE, motion by a URScript program that servos to RTDE input registers.
+"""Universal Robots arm: state over RTDE, motion by a URScript program that follows RTDE input registers.
 
-The program watches the host: when the heartbeat register stands still for `watchdog_s` it brakes and ends, so a dead
-host leaves a standing arm. Nothing starts it but `enable`, and a lost connection does not start it again.
+The program monitors the host: if the heartbeat register does not change for `watchdog_s` it brakes and ends, so the arm
+stops when the host dies. Only `enable` starts the program; a lost connection does not restart it.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from hal.readings import Stamped
 from hal.registry import Context, takes
 
 OUTPUTS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state")
-FIRST_REGISTER = 24  # 0-23 belong to fieldbuses
+FIRST_REGISTER = 24  # 0-23 are reserved for fieldbuses
 JOINTS = 6
 INPUTS = tuple(f"input_int_register_{FIRST_REGISTER + i}" for i in range(JOINTS + 1))
 RAD_PER_COUNT = 1e-6
 RUNNING, PLAYING = 7, 2
 SAFE_MODES = (1, 2)  # normal, reduced
-CONTROL_RATE_HZ = 500  # of the controller, whatever rate RTDE has
+CONTROL_RATE_HZ = 500  # of the controller, whatever the RTDE rate
 PROGRAM_START_S = 1.0
 MOVING_RAD_PER_S = 1e-3
 
@@ -55,7 +55,7 @@ class UrOptions(rtde.RtdeOptions):
     watchdog_s: Annotated[float, Field(ge=0.02, le=2)] = 0.1
 
     def known_arm(self) -> ArmCapabilities:
-        """Kinematics and limits as `kinematics` has them."""
+        """Return the kinematics and limits given by `kinematics`."""
         return capabilities(self.kinematics, command_rate_hz=self.rate_hz, watchdog_s=self.watchdog_s)
 
     @model_validator(mode="after")
@@ -67,7 +67,7 @@ class UrOptions(rtde.RtdeOptions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Modes:
-    """What the controller says about itself."""
+    """Modes reported by the controller."""
 
     robot: int
     safety: int
@@ -75,7 +75,7 @@ class Modes:
 
 
 def servo_program(options: UrOptions) -> str:
-    """URScript that follows the registers and brakes when the heartbeat stops."""
+    """Return the URScript program that follows the registers and brakes when the heartbeat stops."""
     cycles = round(options.watchdog_s * CONTROL_RATE_HZ)
     joints = ", ".join(f"read_input_integer_register({FIRST_REGISTER + 1 + i})*{RAD_PER_COUNT}" for i in range(JOINTS))
     beat = f"read_input_integer_register({FIRST_REGISTER})"
@@ -117,38 +117,38 @@ class Ur(StreamDevice[JointState]):
         self._commands = threading.Lock()
 
     def capabilities(self) -> ArmCapabilities:
-        """From the options."""
+        """Return the capabilities given by the options."""
         return capabilities(
             self._options.kinematics, command_rate_hz=self._options.rate_hz, watchdog_s=self._options.watchdog_s
         )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Newest measured joints."""
+        """Return the newest measured joint state."""
         return self.newest(deadline)
 
     def enable(self, *, deadline: Deadline) -> None:
         """Start the servo program at the measured position.
 
         Raises:
-            DeviceFault: the robot is not running, or stopped by its safety system; a person must see to it.
-            MotionRefused: stopped meanwhile.
+            DeviceFault: the robot is not running, or its safety system stopped it; a person must resolve that.
+            MotionRefused: a stop came meanwhile.
         """
         closings = self._filter.closings
         measured = self.newest(deadline).value.position_rad
         self._require_healthy()
         with self._commands:
             self._beat += 1
-            self._send_registers(measured, deadline)  # before the program: its first target is where the arm stands
+            self._send_registers(measured, deadline)  # first, so that the program starts at the arm's position
             self._run_script(servo_program(self._options), deadline)
             self._was_playing, self._enabled_s = False, now_s()
             try:
                 self._filter.begin(measured, closings=closings)
             except MotionRefused:
-                self._brake(deadline)  # the program may have come after the stop's own
+                self._brake(deadline)  # the program may have arrived after the stop itself
                 raise
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
-        """One set-point into the registers, with a beat of the heart."""
+        """Write one set-point and the next heartbeat into the registers."""
         self.require_open()
         with self._commands:
             sent = self._filter.passed(position_rad, now_s())
@@ -168,17 +168,17 @@ class Ur(StreamDevice[JointState]):
         self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", deadline)
 
     def start(self, link: Link) -> None:
-        """Set up recipes and stream; motion stays off."""
+        """Set up recipes and start the stream; motion stays disabled."""
         self._filter.close()
         self._session.begin(link, outputs=OUTPUTS, rate_hz=self._options.rate_hz, inputs=INPUTS)
         self._host.reset()
         self._last_device_s = 0.0
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each data package; keep the script port from filling up."""
+        """Publish each data package, and drain the script port."""
         for values in self._session.take(chunk):
             self._take(values, arrived_s)
-        if self._scripting.acquire(blocking=False):  # whoever writes a script drains the port himself
+        if self._scripting.acquire(blocking=False):  # a thread that writes a script drains the port itself
             try:
                 self._drain_script()
             finally:
@@ -210,12 +210,12 @@ class Ur(StreamDevice[JointState]):
         )
 
     def lost(self, error: Exception) -> None:
-        """A lost link takes the motion with it."""
+        """Stop the motion and report the loss of the link."""
         self._filter.close()
         super().lost(error)
 
     def release(self) -> None:
-        """Brake if the arm was enabled, then let go."""
+        """Brake if the arm was enabled, then disconnect."""
         if self._filter.is_open:
             self._filter.close()
             with suppress(Exception):

@@ -72,7 +72,7 @@ class UrTouchOptions(UrIoOptions):
 
 
 class UrIo(StreamDevice[Bits]):
-    """A stream of all digital bits of a controller; the subclass says what they mean."""
+    """Stream of all digital bits of a controller; the subclass interprets them."""
 
     inputs: tuple[str, ...] = ()
 
@@ -84,12 +84,12 @@ class UrIo(StreamDevice[Bits]):
         self._host = HostTime()
 
     def start(self, link: Link) -> None:
-        """Set up recipes and stream."""
+        """Set up recipes and start the stream."""
         self._session.begin(link, outputs=OUTPUTS, rate_hz=self._rate_hz, inputs=self.inputs)
         self._host.reset()
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each package that is newer than the last."""
+        """Publish each package that is newer than the last one."""
         for values in self._session.take(chunk):
             device_s = float(values["timestamp"])
             self.publish(
@@ -100,11 +100,11 @@ class UrIo(StreamDevice[Bits]):
 
     @abstractmethod
     def meaning(self, inputs: int, outputs: int) -> Bits:
-        """What these bits say."""
+        """Return the value that these bits represent."""
 
 
 class UrLights(UrIo):
-    """The panel's border lights on a controller's outputs."""
+    """Border lights of the panel on a controller's outputs."""
 
     kind = DeviceKind.LIGHTS
     inputs = INPUTS
@@ -117,14 +117,14 @@ class UrLights(UrIo):
         self._writing = threading.Lock()
 
     def capabilities(self) -> LightsCapabilities:
-        """Channel names from the options."""
+        """Return the channel names given by the options."""
         return LightsCapabilities(channels=self._options.channels, settle_s=self._options.settle_s)
 
     def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> Bits:
-        """Switch all lights; what they do is told by `read_on`.
+        """Switch all lights; `read_on` reports the result.
 
         Raises:
-            InvalidRequest: another number of lights. DeviceUnavailable, DeviceTimeout: it could not be sent.
+            InvalidRequest: wrong number of lights. DeviceUnavailable, DeviceTimeout: the command could not be sent.
         """
         self.require_open()
         wanted = wanted_lights(self.name, self._options.channels, on)
@@ -140,25 +140,25 @@ class UrLights(UrIo):
         return wanted
 
     def read_on(self, *, deadline: Deadline) -> Stamped[Bits]:
-        """Newest feedback, never from before the last command."""
+        """Return the newest feedback, never from before the last command."""
         oldest_s = self.context.clock.now_s() - self.max_age_s
         return self.newest(deadline, not_before_s=max(oldest_s, self._commanded_s))
 
     def start(self, link: Link) -> None:
-        """After a loss the lights return to what was last commanded."""
+        """Restore the last commanded state of the lights after a loss."""
         super().start(link)
         if self._wanted is not None:
             self._switch(link, self._wanted, now_s() + ANSWER_S)
 
     def meaning(self, inputs: int, outputs: int) -> Bits:
-        """Feedback inputs, or the outputs themselves."""
+        """Return the states of the feedback inputs, or of the outputs themselves."""
         o = self._options
         if o.feedback is None:
             return tuple(bool(outputs >> point & 1) for point in o.outputs)
         return tuple(bool(inputs >> point & 1) for point in o.feedback)
 
     def release(self) -> None:
-        """Leave the lights off, if the wire still takes it."""
+        """Switch the lights off, if the link still works."""
         link = self.port.link
         if link is not None:
             with suppress(WireError):
@@ -185,16 +185,16 @@ class UrTouch(UrIo):
         self._options = options
 
     def capabilities(self) -> TouchCapabilities:
-        """Channel names and threshold from the options."""
+        """Return channel names and threshold given by the options."""
         o = self._options
         return TouchCapabilities(channels=o.channels, threshold_n=o.threshold_n, rate_hz=o.rate_hz)
 
     def read_contacts(self, *, deadline: Deadline) -> Stamped[Bits]:
-        """Newest state of the pads."""
+        """Return the newest state of the pads."""
         return self.newest(deadline)
 
     def meaning(self, inputs: int, outputs: int) -> Bits:  # noqa: ARG002  # pads are inputs
-        """The pads' inputs."""
+        """Return the states of the pads' inputs."""
         return tuple(bool(inputs >> point & 1) for point in self._options.contacts)
 
 

@@ -1,4 +1,4 @@
-"""Universal Robots RTDE, protocol version 2: packages in and out of bytes (UR RTDE guide)."""
+"""Universal Robots RTDE, protocol version 2: encoding and parsing of packages (UR RTDE guide)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RtdeOptions(TcpOptions):
     port: PortNumber = 30_004
 
     def claim(self) -> ResourceClaim:
-        """What it owns of the controller."""
+        """Claim the parts of the controller that the client owns."""
         return ResourceClaim(wire=f"tcp {self.host}:{self.port}", bus="RTDE", stations=self.owns)
 
 
@@ -52,7 +52,7 @@ class Recipe:
     widths: tuple[int, ...]
 
     def unpack(self, payload: bytes) -> dict[str, float | int | tuple[float, ...]]:
-        """Values by name from the payload of a `U` package."""
+        """Return values by name from the payload of a `U` package."""
         values = iter(self.packing.unpack(payload[1:]))
         return {
             name: next(values) if width == 1 else tuple(next(values) for _ in range(width))
@@ -60,12 +60,12 @@ class Recipe:
         }
 
     def pack(self, values: Sequence[float | int]) -> bytes:
-        """A `U` package of the flat values."""
+        """Return a `U` package of the flat values."""
         return package("U", bytes([self.id]) + self.packing.pack(*values))
 
 
 def recipe(id_: int, names: Sequence[str], types: Sequence[str]) -> Recipe:
-    """A recipe as the controller confirmed it.
+    """Return a recipe as confirmed by the controller.
 
     Raises:
         RecipeRefused: a variable is NOT_FOUND or IN_USE.
@@ -79,25 +79,25 @@ def recipe(id_: int, names: Sequence[str], types: Sequence[str]) -> Recipe:
 
 
 def package(kind: str, payload: bytes = b"") -> bytes:
-    """Size, type, payload."""
+    """Return a package: size, type, payload."""
     return HEADER.pack(HEADER.size + len(payload), ord(kind)) + payload
 
 
 def outputs_request(names: Sequence[str], rate_hz: float) -> bytes:
-    """Ask for variables at a rate."""
+    """Return the request for variables at a rate."""
     return package("O", struct.pack(">d", rate_hz) + ",".join(names).encode())
 
 
 def split_names(text: bytes) -> tuple[str, ...]:
-    """A comma list, which may end with a comma."""
+    """Return the names in a comma-separated list, which may end with a comma."""
     return tuple(name for name in text.decode("ascii", "replace").split(",") if name)
 
 
 class PackageParser:
-    """Packages out of bytes in any chunks; steps over bytes that begin none.
+    """Parses packages from bytes in chunks of any size; skips bytes that begin no package.
 
     Args:
-        data_size: total size of a `U` package once it is known; others of that type are noise then.
+        data_size: total size of a `U` package once known; packages of that type with another size are noise then.
     """
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class PackageParser:
         self.noise = 0
 
     def feed(self, chunk: bytes) -> list[tuple[str, bytes]]:
-        """`(type, payload)` of each complete package."""
+        """Return `(type, payload)` of each complete package."""
         data = self._buffer + chunk
         at, found = 0, []
         while len(data) - at >= HEADER.size:
@@ -131,5 +131,5 @@ class PackageParser:
         return int(size)
 
     def _begins_at(self, data: bytes, at: int) -> bool:
-        """Could a package begin here, as far as its bytes are known?"""
+        """Return whether a package could begin here, judged by the bytes known."""
         return len(data) - at < HEADER.size or self._size_at(data, at) is not None

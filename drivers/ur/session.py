@@ -1,4 +1,4 @@
-"""A client's side of an RTDE connection, the same for all that hang on a controller: handshake, recipes, data."""
+"""Client side of an RTDE connection, shared by all clients of a controller: handshake, recipes, data."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ PLAUSIBLE = {"timestamp": (0.0, 1e9), "robot_mode": (-1, 255), "safety_mode": (0
 
 
 class RtdeSession:
-    """Sets up the recipes on a fresh link and turns its bytes into values.
+    """Sets up the recipes on a new link and decodes its bytes into values.
 
     Args:
-        answer_s: how long an answer is waited for.
+        answer_s: how long to wait for an answer.
 
     Attributes:
-        inputs: recipe of what is sent to the controller; None before `begin` has asked for one.
+        inputs: recipe of the data sent to the controller; None before `begin` has requested one.
     """
 
     def __init__(self, *, answer_s: float = ANSWER_S) -> None:
@@ -31,14 +31,14 @@ class RtdeSession:
         self.inputs: rtde.Recipe | None = None
 
     def begin(self, link: Link, *, outputs: Sequence[str], rate_hz: float, inputs: Sequence[str] = ()) -> None:
-        """Agree on version 2, set up the recipes, start the stream.
+        """Agree on version 2, set up the recipes, and start the stream.
 
         Args:
-            outputs: variables of the data packages; `timestamp` is one of them. RTDE has no check sum: where bytes are lost, all
-                that follows them in the package is shifted, so one of `PLAUSIBLE` had best be the last.
+            outputs: variables of the data packages, including `timestamp`. RTDE has no checksum: lost bytes shift all
+                that follows them in the package, so preferably one of `PLAUSIBLE` is last.
 
         Raises:
-            Refused: another version, or a variable that the controller does not give. NoAnswer, LinkLost.
+            Refused: another version, or a variable that the controller does not provide. NoAnswer, LinkLost.
         """
         self._parser, self._last_s = rtde.PackageParser(), -math.inf
         if self._ask(link, rtde.package("V", b"\x00\x02"), "V")[:1] != b"\x01":
@@ -51,9 +51,7 @@ class RtdeSession:
         self._parser.data_size = rtde.HEADER.size + 1 + self._outputs.packing.size
 
     def take(self, chunk: bytes) -> list[dict[str, Any]]:
-        """Values by name of each data package that is complete now and makes sense; one with the time of the last is the
-        same again.
-        """
+        """Return the values by name of each complete, plausible data package, without repetitions."""
         found = []
         for kind, payload in self._parser.feed(chunk):
             if kind != "U" or self._outputs is None or payload[0] != self._outputs.id:
@@ -78,6 +76,6 @@ class RtdeSession:
         until_s = now_s() + self._answer_s
         while chunk := link.read(until_s):
             for got, payload in self._parser.feed(chunk):
-                if got == kind and rtde.package(got, payload) != request:  # texts may come in between; echoes are ours
+                if got == kind and rtde.package(got, payload) != request:  # else a text in between, or our echo
                     return payload
         raise NoAnswer(f"no answer to RTDE request {kind!r}")

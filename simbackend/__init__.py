@@ -1,1 +1,1 @@
-"""The simulated cell: a PyBullet world in a process of its own and the HAL devices over it."""
+"""Simulated cell: a PyBullet world in a process of its own, and the HAL devices that use it."""

@@ -32,12 +32,12 @@ class ArmOptions(SimOptions):
     lookahead_s: Annotated[float, Field(ge=0, le=0.2)] = 0.0
 
     def known_arm(self) -> ArmCapabilities:
-        """Kinematics and limits of the model."""
+        """Return kinematics and limits of the model."""
         return MODELS[self.model]().capabilities
 
 
 class SimArm(SimDevice[JointState]):
-    """Position-controlled arm; set-points go out with the next step of the clock."""
+    """Position-controlled arm; set-points are sent with the next step of the clock."""
 
     def __init__(self, context: Context, options: ArmOptions) -> None:
         super().__init__(context, DeviceKind.ARM, options)
@@ -45,13 +45,13 @@ class SimArm(SimDevice[JointState]):
         self._capabilities = replace(MODELS[options.model]().capabilities, command_rate_hz=self._world.rate_hz)
         self._lower = np.asarray(self._capabilities.lower_rad)
         self._upper = np.asarray(self._capabilities.upper_rad)
-        # One tick late is two ticks of way, so a single missed tick is no clipped set-point.
-        # Behind a wire the drives trail the set-points by their lookahead, and those come in bunches.
+        # A set-point one tick late covers two ticks of travel, so a single missed tick must not clip it.
+        # Behind an emulated link the drives lag the set-points by their lookahead, and set-points arrive in bunches.
         ticks_s = 2.0 / self._world.rate_hz + 2.0 * options.lookahead_s
         self._stride = ticks_s * np.asarray(self._capabilities.velocity_rad_per_s)
 
     def capabilities(self) -> ArmCapabilities:
-        """Kinematics and limits."""
+        """Return kinematics and limits."""
         return self._capabilities
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
@@ -79,7 +79,7 @@ class SimArm(SimDevice[JointState]):
         return sent
 
     def enable(self, *, deadline: Deadline) -> None:
-        """Let the drives follow from the next tick on."""
+        """Enable the drives from the next tick on."""
         self._check(deadline)
         self._world.enable()
 
@@ -89,7 +89,7 @@ class SimArm(SimDevice[JointState]):
         self._world.stop()
 
     def truth(self, initial_s: float = 0.0) -> Truth:
-        """For the judge of a finished mission and for tests; nothing else may call it."""
+        """Return the true state of the world; only the judge of a finished mission and tests may call this."""
         return self._world.truth(initial_s)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[JointState, Quality, Cause]:

@@ -1,4 +1,4 @@
-"""The two simulated arms as Denavit-Hartenberg tables, and the URDF that PyBullet loads, generated from them."""
+"""The two simulated arms as Denavit-Hartenberg tables, and the URDF generated from them for PyBullet."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DOF = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ArmModel:
-    """Everything the world needs to build one arm; `mass_kg` and `torque_nm` are per link and joint."""
+    """Everything the world needs to build one arm; `mass_kg` is given per link and `torque_nm` per joint."""
 
     capabilities: ArmCapabilities
     mass_kg: tuple[float, ...]
@@ -25,7 +25,10 @@ class ArmModel:
 
 
 def t3() -> ArmModel:
-    """T3-726-like: 1.04 m from shoulder to flange, spherical wrist, tip at most 1.0 m/s; own link lengths."""
+    """Return a T3-726-like arm: 1.04 m from shoulder to flange, spherical wrist, tip at most 1.0 m/s.
+
+    Own link lengths.
+    """
     quarter = math.pi / 2.0
     links = (
         DhLink(d_m=0.70, a_m=0.0, alpha_rad=quarter),
@@ -50,7 +53,7 @@ def t3() -> ArmModel:
 
 
 def ur10e() -> ArmModel:
-    """UR10e-like: the maker's published DH table; masses and radii are rounded."""
+    """Return a UR10e-like arm: the maker's published DH table; masses and radii are rounded."""
     quarter = math.pi / 2.0
     links = (
         DhLink(d_m=0.1807, a_m=0.0, alpha_rad=quarter),
@@ -99,7 +102,7 @@ def _capabilities(
 
 
 def base_from_flange(links: tuple[DhLink, ...], position_rad: np.ndarray) -> RigidTransform:
-    """Forward kinematics: the product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) over the joints."""
+    """Return base_from_flange as the product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) over the joints."""
     pose = RigidTransform.identity()
     for dh, q in zip(links, position_rad, strict=True):
         turn = RigidTransform.from_rotation(Rotation.from_euler("z", q + dh.offset_rad))
@@ -108,17 +111,17 @@ def base_from_flange(links: tuple[DhLink, ...], position_rad: np.ndarray) -> Rig
 
 
 def link_from_next(dh: DhLink) -> RigidTransform:
-    """The fixed part of a standard DH link: Tz(d) Tx(a) Rx(alpha)."""
+    """Return the fixed part of a standard DH link: Tz(d) Tx(a) Rx(alpha)."""
     return RigidTransform.from_components([dh.a_m, 0.0, dh.d_m], Rotation.from_euler("x", dh.alpha_rad))
 
 
 def arm_urdf(
     model: ArmModel, *, flange_from_sensor: RigidTransform, flange_from_grip: RigidTransform, load_kg: float
 ) -> str:
-    """URDF of arm, force/torque sensor and gripper, from primitives.
+    """Return the URDF of arm, force/torque sensor and gripper, built from primitives.
 
-    Link i turns about z at the end of link i - 1: its frame is DH frame i - 1 turned by q_i. The flange is
-    fixed to link 6.
+    Link i turns about z at the end of link i - 1: its frame is DH frame i - 1 turned by q_i. The flange is fixed to
+    link 6.
     """
     caps = model.capabilities
     lines = ['<robot name="arm">', *link("base", inertial(10.0, (0, 0, 0), (1.0, 1.0, 1.0)))]
@@ -143,14 +146,14 @@ PAINT: tuple[Colour, Colour] = ((0.85, 0.45, 0.10), (0.30, 0.32, 0.35))
 def _link(
     name: str, mass_kg: float, end_m: tuple[float, float, float], radius_m: float, paint: Colour, *, is_foot: bool
 ) -> list[str]:
-    """A capsule from the joint to the next one: a cylinder and a ball, the shape that `link_radius_m` promises.
+    """Return a capsule from this joint to the next: a cylinder and a sphere, the shape that `link_radius_m` describes.
 
-    The foot stands in the floor, so it is to be seen only: a contact for good would cost time in every tick.
+    The foot stands in the floor, so it has no collision shape: a permanent contact would cost time in every tick.
     """
     middle, length_m = along((0.0, 0.0, 0.0), end_m)
     across = mass_kg * (3.0 * radius_m**2 + length_m**2) / 12.0 + 1e-4
     lengthwise = mass_kg * radius_m**2 / 2.0 + 1e-4
-    # Inertia is given along the link's own axes; a link lies along x or along z.
+    # Inertia is given in the link's own axes; a link lies along x or along z.
     inertia = (lengthwise, across, across) if abs(end_m[0]) > abs(end_m[2]) else (across, across, lengthwise)
     parts = [
         inertial(mass_kg, tuple(middle.translation), inertia),

@@ -1,4 +1,4 @@
-"""`sim:camera`: a camera on the flange, drawn on request at the present tick."""
+"""`sim:camera`: a camera on the flange; images are rendered on request at the present tick."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CameraOptions(SimOptions):
 
 
 class SimCamera(SimDevice[Image]):
-    """Global-shutter camera; its true lens and mount are drawn from the seed about the calibration record."""
+    """Global-shutter camera; its true lens and mount are drawn from the seed around the calibration record."""
 
     def __init__(self, context: Context, options: CameraOptions) -> None:
         super().__init__(context, DeviceKind.CAMERA, options)
@@ -67,7 +67,7 @@ class SimCamera(SimDevice[Image]):
         self._newest: tuple[int, float, Image] | None = None
 
     def capabilities(self) -> CameraCapabilities:
-        """Size, colour and nominal lens."""
+        """Return size, colour and nominal lens."""
         return CameraCapabilities(
             width_px=self._options.width_px,
             height_px=self._options.height_px,
@@ -77,7 +77,7 @@ class SimCamera(SimDevice[Image]):
         )
 
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
-        """The image of the present tick; drawing it lets no time pass."""
+        """Return the image of the present tick; rendering it does not advance time."""
         return self._sample(deadline)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[Image, Quality, Cause]:
@@ -96,7 +96,7 @@ class SimCamera(SimDevice[Image]):
 
 
 def nominal_lens(width_px: int, height_px: int) -> CameraIntrinsics:
-    """The maker's data sheet: no distortion, axis through the middle."""
+    """Return the lens of the maker's data sheet: no distortion, axis through the centre."""
     focal_px = FOCAL_RATIO * width_px
     return CameraIntrinsics(
         width_px=width_px,
@@ -109,7 +109,7 @@ def nominal_lens(width_px: int, height_px: int) -> CameraIntrinsics:
 
 
 def scaled(lens: CameraIntrinsics, width_px: int, height_px: int) -> CameraIntrinsics:
-    """The same lens over another pixel count."""
+    """Return the same lens with another pixel count."""
     sx, sy = width_px / lens.width_px, height_px / lens.height_px
     return CameraIntrinsics(
         width_px=width_px,

@@ -1,7 +1,7 @@
-"""From an ideal drawing to what a camera would have delivered: lens, glow, glare, vignette, blur, exposure, noise.
+"""Turns an ideal rendering into a realistic camera image: lens, glow, glare, vignette, blur, exposure, noise.
 
-The drawing has no anti-aliasing, so it is made larger and reduced. Without the glow round a lamp, subtracting
-lights-off from lights-on would be trivially perfect.
+The rendering has no anti-aliasing, so it is made larger and then reduced. Without the glow around a lamp, subtracting
+the lights-off image from the lights-on image would be unrealistically perfect.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SensorOptions:
 
 
 class CameraSensor:
-    """The sensor behind one true lens."""
+    """Camera sensor behind one true lens."""
 
     def __init__(self, lens: CameraIntrinsics, options: SensorOptions) -> None:
         self._lens, self._options = lens, options
@@ -57,7 +57,7 @@ class CameraSensor:
         scale = np.array(self.drawn) / size
         centre = -low * f + margin_px
         self.focal = (float(f[0] * scale[0]), float(f[1] * scale[1]))
-        # A reduced pixel covers `scale` drawn ones: its centre u is at scale (u + 1/2) - 1/2.
+        # A reduced pixel covers `scale` rendered ones: its centre u is at scale (u + 1/2) - 1/2.
         drawn_centre = scale * (centre + 0.5) - 0.5
         self.centre = (float(drawn_centre[0]), float(drawn_centre[1]))
         self._reduced = (int(size[0]), int(size[1]))
@@ -67,7 +67,7 @@ class CameraSensor:
         self._vignette = _vignette(lens, options.vignette)
 
     def expose(self, info: PictureInfo, radiance: Grey, random: np.random.Generator) -> Pixels:
-        """The image, (H, W) or (H, W, 3) uint8, of an ideal drawing of size `drawn`."""
+        """Return the image, (H, W) or (H, W, 3) uint8, from an ideal rendering of size `drawn`."""
         reduced = cv2.resize(radiance, self._reduced, interpolation=cv2.INTER_AREA)
         places, fractions = self._maps
         bent = cv2.remap(reduced, places, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -79,7 +79,7 @@ class CameraSensor:
         return self._digitise(seen * (vignette * gain), random)
 
     def _glow(self, info: PictureInfo, radiance: Grey) -> Grey:
-        """Light that a lamp throws on the plate round it (times what is there), and glare in the lens (beside it)."""
+        """Return the light that lamps throw on the plate around them (times its radiance), and glare in the lens (added)."""
         h, w = radiance.shape[:2]
         v, u = np.mgrid[0:h:GLOW_STEP_PX, 0:w:GLOW_STEP_PX].astype(np.float32)
         spill = np.zeros_like(u)
@@ -116,7 +116,7 @@ class CameraSensor:
         return (float(u), float(v)), float(lens.fx_px / point[2])
 
     def _noise(self, shape: tuple[int, ...], random: np.random.Generator) -> Grey:
-        """Normal numbers from a random place of a long table: drawing them anew took half of every image's time."""
+        """Return normal noise from a random offset in a long table: drawing it anew took half of the time of every image."""
         count = int(np.prod(shape))
         if self._table.size < 4 * count:
             self._table = np.random.default_rng(0).standard_normal(4 * count, np.float32)
@@ -124,7 +124,7 @@ class CameraSensor:
         return self._table[first : first + count].reshape(shape)
 
     def _digitise(self, radiance: Grey, random: np.random.Generator) -> Pixels:
-        """Shot noise (variance = mean, in electrons), read noise, full well, eight bits."""
+        """Apply shot noise (variance = mean, in electrons), read noise, full well, and quantisation to eight bits."""
         well = np.float32(self._options.full_well_electrons)
         electrons = np.minimum(radiance, np.float32(1.2)) * well
         sigma = np.sqrt(electrons + np.float32(self._options.read_noise_electrons**2))
@@ -134,7 +134,7 @@ class CameraSensor:
 
 
 def _enlarge(image: Grey, width: int, height: int) -> Grey:
-    """Back to full size: coarse pixel i is at fine pixel i * step."""
+    """Return the image enlarged to full size: coarse pixel i is at fine pixel i * step."""
     step = GLOW_STEP_PX
     matrix = np.array([[step, 0, 0], [0, step, 0]], np.float32)
     large = cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -142,7 +142,7 @@ def _enlarge(image: Grey, width: int, height: int) -> Grey:
 
 
 def _ideal_grid(lens: CameraIntrinsics) -> Array:
-    """(H, W, 2) undistorted normalised coordinates of every pixel."""
+    """Return (H, W, 2) undistorted normalised coordinates of every pixel."""
     u, v = np.meshgrid(np.arange(lens.width_px, dtype=float), np.arange(lens.height_px, dtype=float))
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-10)
@@ -153,7 +153,7 @@ def _ideal_grid(lens: CameraIntrinsics) -> Array:
 
 
 def _vignette(lens: CameraIntrinsics, strength: float) -> Grey:
-    """Cosine-fourth fall-off, `strength` 1 for all of it."""
+    """Return the cosine-fourth fall-off; `strength` 1 applies all of it."""
     u, v = np.meshgrid(np.arange(lens.width_px), np.arange(lens.height_px))
     tan2 = ((u - lens.cx_px) / lens.fx_px) ** 2 + ((v - lens.cy_px) / lens.fy_px) ** 2
     return (1.0 - strength * (1.0 - 1.0 / (1.0 + tan2) ** 2)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The cell's side of the pipe: owns the world process, keeps the newest snapshot, lets the clock drive the world."""
+"""Client of the world process: starts it, keeps its newest snapshot, and lets the cell's clock advance it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MOST_TICKS_BEHIND = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """A snapshot and when it was valid on the cell's clock."""
+    """Snapshot, and when it was valid on the cell's clock."""
 
     snapshot: Snapshot
     host_time_s: float
@@ -50,7 +50,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraView:
-    """A pinhole picture to draw; pixel (0, 0) is a pixel's centre."""
+    """Pinhole picture to render; pixel (0, 0) is the centre of a pixel."""
 
     flange_from_camera: RigidTransform
     width: int
@@ -61,7 +61,7 @@ class CameraView:
 
 
 class WorldClient:
-    """One world process. Commands are stored and go out with the next step; `advance` is all that lets time pass."""
+    """Client of one world process. Commands are stored and sent with the next step; only `advance` lets time pass."""
 
     def __init__(self, config: WorldConfig, clock: Clock) -> None:
         self.cell = config.cell
@@ -69,13 +69,13 @@ class WorldClient:
         self.rate_hz = config.cell.file.cell.control_rate_hz
         self.proximity: tuple[str, ...] = ()
         self._clock = clock
-        self._lock = threading.RLock()  # of the world: held while it steps, and while it draws
-        self._orders = threading.Lock()  # of the next step's request, so that nobody waits for a picture to give one
+        self._lock = threading.RLock()  # guards the world: held while it steps and while it renders
+        self._orders = threading.Lock()  # guards the next step's request, so that commands do not wait for a picture
         self._request = np.zeros(REQUEST)
-        self._under_way = 0  # what the step now in the world says to the drives
+        self._under_way = 0  # drive command of the step in progress
         self._owed_ticks = 0.0
         self._events: list[tuple[int, int, Callable[[], None]]] = []
-        self._order = itertools.count()  # of two events at one tick the first comes first
+        self._order = itertools.count()  # breaks ties: of two events at one tick the first added comes first
         self._link = WorldLink(config)
         self._take(self._link.first)
         self._begun_s = clock.now_s()
@@ -83,7 +83,7 @@ class WorldClient:
 
     @classmethod
     def shared(cls, context: Context) -> WorldClient:
-        """The world of a device's cell; the first device starts it."""
+        """Return the world of a device's cell; the first device starts it."""
         return context.shared.get("world", lambda: cls.start(context))
 
     @classmethod
@@ -91,8 +91,8 @@ class WorldClient:
         """Start the world of a cell.
 
         Raises:
-            ConfigError: no cell, a clock that no world can drive, or an unknown arm model.
-            DeviceUnavailable: the world process does not come up.
+            ConfigError: no cell, a clock that cannot drive a world, or an unknown arm model.
+            DeviceUnavailable: the world process does not start.
         """
         cell = context.cell
         if cell is None:
@@ -122,7 +122,7 @@ class WorldClient:
     # -- time -----------------------------------------------------------------------------------------------------
 
     def advance(self, duration_s: float) -> float:
-        """Send what is pending, step the world, take its snapshot; returns the new simulated time."""
+        """Send pending commands, step the world and take its snapshot; return the new simulated time."""
         with self._lock:
             self._owed_ticks += duration_s * self.rate_hz + self._missed_ticks()
             ticks = max(1, int(self._owed_ticks + 0.5))
@@ -136,10 +136,10 @@ class WorldClient:
             return self.frame.snapshot.stamp_s
 
     def _missed_ticks(self) -> float:
-        """Ticks by which a world at the wall's pace has fallen behind the wall.
+        """Return the ticks by which a world paced by the wall clock has fallen behind it.
 
-        Were they lost, a controller that goes by the wall would hurry through a world that lags, and the arm would leap.
-        After a pause in which nobody let time pass, the world takes up from where it stood.
+        If they were dropped, a controller that follows the wall clock would run ahead of a lagging world, and the arm
+        would jump. After a pause in which nobody advanced time, the world continues from where it stood.
         """
         if isinstance(self._clock, SimClock):
             return 0.0
@@ -165,7 +165,7 @@ class WorldClient:
         self.frame = Frame(snapshot, stamp_s)
 
     def at(self, time_s: float, action: Callable[[], None]) -> None:
-        """Run `action` when the world reaches a simulated time; at once when it has."""
+        """Run `action` when the world reaches a simulated time; immediately if it already has."""
         tick = round(time_s * self.rate_hz)
         with self._lock:
             if tick <= self.frame.snapshot.tick:
@@ -181,7 +181,7 @@ class WorldClient:
 
     @property
     def is_enabled(self) -> bool:
-        """Will the drives follow a set-point that is given now?"""
+        """Return whether the drives would follow a set-point given now."""
         for orders in (int(self._request[2]), self._under_way):
             if orders & Drive.ENABLE:
                 return True
@@ -190,40 +190,43 @@ class WorldClient:
         return self.frame.snapshot.is_enabled
 
     def enable(self) -> None:
-        """Drives follow from the next tick on."""
+        """Enable the drives from the next tick on."""
         with self._orders:
             self._request[2] = (int(self._request[2]) & Drive.STOP) | Drive.ENABLE
 
     def stop(self) -> None:
-        """Drives brake from the next tick on, whatever else was pending."""
+        """Brake from the next tick on, whatever else was pending."""
         with self._orders:
             self._request[2] = Drive.STOP
 
     def aim_arm(self, position_rad: Array) -> None:
-        """The set-point of the next tick."""
+        """Set the set-point of the next tick."""
         with self._orders:
             self._request[2] = int(self._request[2]) | Drive.SETPOINT
             self._request[JOINTS_AT : JOINTS_AT + len(position_rad)] = position_rad
 
     def aim_gripper(self, width_m: float, force_n: float, speed_m_per_s: float) -> None:
-        """The gripper's next goal."""
+        """Set the gripper's next goal."""
         with self._orders:
             self._request[GRIPPER_AT : GRIPPER_AT + 4] = (1.0, width_m, force_n, speed_m_per_s)
 
     def switch_lights(self, on: tuple[bool, ...]) -> None:
-        """The border lights from the next tick on."""
+        """Switch the border lights from the next tick on."""
         with self._orders:
             self._request[LIGHTS_AT : LIGHTS_AT + 1 + len(on)] = (1.0, *on)
 
     # -- pictures and truth ---------------------------------------------------------------------------------------
 
     def radiance(self, view: CameraView, *, is_colour: bool) -> tuple[PictureInfo, NDArray[np.float32]]:
-        """Light that reaches an ideal pinhole at the present tick, (H, W, 1) or (H, W, 3), white plate = about 0.8."""
+        """Return the radiance at an ideal pinhole at the present tick, (H, W, 1) or (H, W, 3).
+
+        The white plate is about 0.8.
+        """
         channels = 3 if is_colour else 1
         return self._picture(view, Picture(channels), (view.height, view.width, channels))
 
     def depth_m(self, view: CameraView) -> tuple[PictureInfo, NDArray[np.float32]]:
-        """Depth along the view, (H, W), NaN where there is nothing, at the present tick."""
+        """Return the depth along the view at the present tick, (H, W), NaN where there is no surface."""
         return self._picture(view, Picture.DEPTH, (view.height, view.width))
 
     def _picture(
@@ -231,12 +234,12 @@ class WorldClient:
     ) -> tuple[PictureInfo, NDArray[np.float32]]:
         matrix = np.asarray(view.flange_from_camera.as_matrix())[:3]
         lens = [view.width, view.height, view.near_m, *view.focal, *view.centre]
-        # With the lock of the steps: a picture belongs to one tick.
+        # Holds the lock of the steps, so that a picture belongs to one tick.
         with self._lock:
             return self._link.picture([*lens, float(kind), *matrix.ravel().tolist()], shape)
 
     def truth(self, initial_s: float = 0.0) -> Truth:
-        """What the judge may ask for when a mission has ended; `initial` is of a simulated time."""
+        """Return the true states for the judge of a finished mission; `initial` refers to the given simulated time."""
         with self._lock:
             truth = self._link.ask(Op.TRUTH, initial_s)
         if not isinstance(truth, Truth):
@@ -249,7 +252,7 @@ class WorldClient:
 
 
 def true_mount(cell: Cell, draws: Draws, device: str) -> RigidTransform:
-    """Where a device truly sits on its parent.
+    """Return the true pose of a device on its parent.
 
     Raises:
         ConfigError: no mount, or a calibration record without one.
@@ -263,14 +266,14 @@ def true_mount(cell: Cell, draws: Draws, device: str) -> RigidTransform:
 
 
 def _sim_devices(cell: Cell) -> list[tuple[str, str, dict[str, object]]]:
-    """(device, driver, options) of all that this world stands behind, on its own or behind an emulator."""
+    """Return (device, driver, options) of all devices that use this world, directly or behind an emulator."""
     direct = [(name, device.driver, device.options) for name, device in cell.file.devices.items()]
     behind = [(name, emulator.driver, emulator.options) for name, emulator in cell.file.emulators.items()]
     return [entry for entry in direct + behind if entry[1].startswith("sim:")]
 
 
 def _check_park(cell: Cell) -> None:
-    """The arm begins in its parking place, so that has to be one."""
+    """Check the park position, because the arm starts there."""
     limits = MODELS[_arm_model(cell)]().capabilities
     park = cell.file.workspace.park_rad
     if len(park) == DOF and all(a < q < b for a, q, b in zip(limits.lower_rad, park, limits.upper_rad, strict=True)):

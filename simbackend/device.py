@@ -1,4 +1,4 @@
-"""What all simulated devices share: stamps, health, and the five faults that can be injected."""
+"""Code shared by all simulated devices: stamps, health, and the five faults that can be injected."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ class SimOptions(Strict):
 
 
 def parse(options: dict[str, Any], model: type[Options], context: Context) -> Options:
-    """Options as their strict model.
+    """Return the options as their strict model.
 
     Raises:
-        ConfigError: names the key.
+        ConfigError: the message names the key.
     """
     return validate(options, model, source=f"devices.{context.name}.options")
 
 
 class SimDevice(Generic[T]):
-    """One device over the world. A subclass says what it `_measure`s and how a bias changes it.
+    """Device in the simulated world; a subclass defines what it `_measure`s and how a bias changes it.
 
-    Noise is drawn from (seed, device, tick) alone, so reading twice, or from a second thread, changes nothing.
+    Noise depends on (seed, device, tick) only, so a second read, or a read from another thread, changes nothing.
     """
 
     def __init__(self, context: Context, kind: DeviceKind, options: SimOptions) -> None:
@@ -62,16 +62,16 @@ class SimDevice(Generic[T]):
 
     @property
     def name(self) -> str:
-        """Name in the cell file."""
+        """Return the device's name in the cell file."""
         return self._name
 
     @property
     def kind(self) -> DeviceKind:
-        """Which interface this is."""
+        """Return the kind of device."""
         return self._kind
 
     def health(self) -> Health:
-        """State of the link and the newest sample."""
+        """Return the state of the link and of the newest sample."""
         cause = {Fault.SILENT: Cause.TIMEOUT, Fault.DISCONNECTED: Cause.COMM}.get(
             self._fault or Fault.BIASED, Cause.NONE
         )
@@ -87,19 +87,19 @@ class SimDevice(Generic[T]):
         )
 
     def close(self) -> None:
-        """Later calls raise `DeviceUnavailable`; the world itself belongs to the cell."""
+        """Close the device, so that later calls raise `DeviceUnavailable`; the world itself belongs to the cell."""
         self._is_closed = True
 
     def inject_fault(self, fault: Fault | None, *, magnitude: float = 0.0) -> None:
-        """Begin a fault, or end it with None. Stale and frozen devices keep the sample of this moment."""
+        """Begin a fault, or end it with None. Stale and frozen devices keep their present sample."""
         self._kept = self._fresh(0.0) if fault in (Fault.STALE, Fault.FROZEN) else None
         self._fault, self._magnitude = fault, magnitude
 
     def _sample(self, deadline: Deadline) -> Stamped[T]:
-        """The newest sample, as the fault lets it through.
+        """Return the newest sample, as modified by the fault.
 
         Raises:
-            DeviceTimeout: silent; at once, because no waiting would help and a wait would move the world.
+            DeviceTimeout: silent; raised at once, because waiting would not help and would advance the world.
             DeviceUnavailable: closed or disconnected.
         """
         self._check(deadline)
@@ -114,7 +114,7 @@ class SimDevice(Generic[T]):
         return sample
 
     def _check(self, deadline: Deadline) -> None:
-        """Refuse when closed, lost or silent."""
+        """Raise an error if the device is closed, disconnected or silent."""
         if self._is_closed or self._fault is Fault.DISCONNECTED:
             self._errors += 1
             what = "is closed" if self._is_closed else "is not connected"
@@ -149,11 +149,11 @@ class SimDevice(Generic[T]):
         )
 
     def _tick_of(self, snapshot: Snapshot) -> int:
-        """The tick at which this device took the sample that a snapshot holds."""
+        """Return the tick at which this device took the sample in a snapshot."""
         return snapshot.tick
 
     def _measure(self, frame: Frame, bias: float) -> tuple[T, Quality, Cause]:
-        """Value at a frame, with the bias of an injected fault in the device's own unit."""
+        """Return the value at a frame, with the bias of an injected fault in the device's own unit."""
         raise NotImplementedError
 
 

@@ -1,4 +1,4 @@
-"""What the seed decides: every quantity has a stream of its own, so adding one never changes another."""
+"""Random quantities derived from the seed: each has a stream of its own, so adding one never changes another."""
 
 from __future__ import annotations
 
@@ -28,50 +28,53 @@ NOISE_BLOCK = 512
 
 
 class TickNoise:
-    """Numbers as a function of the tick, made a block at a time: a generator for each tick costs ten times more."""
+    """Random numbers as a function of the tick, generated in blocks: a generator per tick costs ten times more."""
 
     def __init__(self, draws: Draws, name: str, width: int) -> None:
         self._draws, self._name, self._width = draws, name, width
         self._block: tuple[int, Array] = (-1, np.empty((0, width)))
 
     def at(self, tick: int) -> Array:
-        """(width,) numbers of a tick."""
+        """Return the (width,) numbers of a tick."""
         number, row = divmod(tick, NOISE_BLOCK)
         held, block = self._block
         if held != number:
             block = self._draws.at_tick(self._name, number).standard_normal((NOISE_BLOCK, self._width))
-            self._block = (number, block)  # one assignment, so that a second reader sees the old or the new pair
+            self._block = (number, block)  # one assignment, so that another thread sees the old or the new pair
         numbers: Array = block[row]
         return numbers
 
 
 @dataclass(frozen=True, slots=True)
 class Draws:
-    """Random numbers by name."""
+    """Random numbers by name, derived from the seed."""
 
     seed: int
 
     def stream(self, name: str) -> np.random.Generator:
-        """A generator that depends on the seed and the name only."""
+        """Return a generator that depends on the seed and the name only."""
         return np.random.default_rng([self.seed, zlib.crc32(name.encode())])
 
     def at_tick(self, name: str, tick: int) -> np.random.Generator:
-        """Counter-based: the noise of `name` at `tick`, whoever asks and however often."""
+        """Return the generator for the noise of `name` at `tick`.
+
+        Counter-based, so it does not depend on who asks or how often.
+        """
         return np.random.Generator(
             np.random.Philox(key=[self.seed, zlib.crc32(name.encode())], counter=[0, 0, 0, tick])
         )
 
     def noise(self, name: str, width: int) -> TickNoise:
-        """Standard normal numbers of `name`, `width` a tick, for sensors that are read every tick."""
+        """Return standard normal numbers of `name`, `width` per tick, for sensors that are read every tick."""
         return TickNoise(self, name, width)
 
     def mount(self, device: str, record: MountRecord) -> RigidTransform:
-        """Where the device truly sits: the record's pose, off by its own sigma."""
+        """Return the device's true pose: the record's pose, perturbed according to its sigma."""
         sigma = np.array([*record.sigma_m, *record.sigma_rad])
         return perturbed(record.pose().parent_from_child, sigma * self.stream(f"mount/{device}").standard_normal(6))
 
     def lens(self, device: str, nominal: CameraIntrinsics) -> CameraIntrinsics:
-        """The true lens of a camera whose record says `nominal`."""
+        """Return the true lens of a camera whose record says `nominal`."""
         z = self.stream(f"lens/{device}").standard_normal(4)
         focal = 1.0 + FOCAL_RATIO_SIGMA * z[0]
         k1, k2, p1, p2, k3 = nominal.distortion
@@ -86,7 +89,7 @@ class Draws:
         )
 
     def load(self, device: str, nominal: ToolLoad) -> ToolLoad:
-        """The true tool load and sensor bias."""
+        """Return the true tool load and sensor bias."""
         z = self.stream(f"load/{device}").standard_normal(10)
         centre = np.asarray(nominal.centre_of_mass_m) + CENTRE_OF_MASS_SIGMA_M * z[1:4]
         bias = np.asarray(nominal.bias) + np.array([BIAS_SIGMA_N] * 3 + [BIAS_SIGMA_NM] * 3) * z[4:]
@@ -97,11 +100,11 @@ class Draws:
         )
 
     def panel_pose(self, workspace: WorkspaceSection) -> RigidTransform:
-        """base_from_panel, uniform about the expected pose."""
+        """Return base_from_panel, uniform around the expected pose."""
         spread_m = min(PANEL_SPREAD_M, workspace.position_tolerance_m)
         spread_rad = min(PANEL_SPREAD_RAD, workspace.angle_tolerance_rad)
         u = self.stream("panel/pose").uniform(-1.0, 1.0, 6)
-        # Drawn in a cube; what lies beyond the file's promise (the corners) is drawn in to it.
+        # Drawn in a cube; points beyond the limit of the cell file (the corners) are moved in to it.
         shift = spread_m * u[:3]
         shift *= min(1.0, workspace.position_tolerance_m / max(float(np.linalg.norm(shift)), 1e-12))
         turn = spread_rad * u[3:] / max(1.0, float(np.linalg.norm(u[3:])))

@@ -1,4 +1,4 @@
-"""The drives of arm and gripper: what happens between a set-point and the motors."""
+"""Drives of arm and gripper: the behaviour between set-points and motors."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ START_WIDTH_M = 0.040
 
 
 class ArmDrive:
-    """Follows set-points, brakes at the acceleration limit on `stop`, and gives up when a moving stream breaks off.
+    """Follows set-points, brakes at the acceleration limit on `stop`, and stops when set-points cease during a motion.
 
     Args:
-        lookahead_s: what comes over a wire comes in bunches and gaps; the drives then smooth the set-points as a
-            critically damped follower, x'' = w^2 (goal - x) - 2 w x' with w = 2 / lookahead, which trails a steady
+        lookahead_s: set-points that come over a link arrive in bunches and gaps, so the drives smooth them with a
+            critically damped follower, x'' = w^2 (goal - x) - 2 w x' with w = 2 / lookahead, which lags a steady
             stream by `lookahead_s`. With 0 each set-point is for the next tick.
     """
 
@@ -40,7 +40,7 @@ class ArmDrive:
         self.is_enabled = False
 
     def aim(self, position_rad: Array) -> None:
-        """A new set-point for the next tick; ignored while disabled."""
+        """Set the set-point for the next tick; ignored while disabled."""
         if not self.is_enabled:
             return
         self._fresh = True
@@ -52,7 +52,7 @@ class ArmDrive:
         self.speed = self._last_speed
 
     def enable(self, measured_rad: list[float]) -> None:
-        """Begin to follow; the set-point is where the arm is."""
+        """Start to follow, with the measured position as set-point."""
         self.setpoint = np.asarray(measured_rad, float).copy()
         self._goal = self.setpoint
         self.speed = np.zeros_like(self.setpoint)
@@ -60,11 +60,11 @@ class ArmDrive:
         self._last_speed = self.speed
 
     def stop(self) -> None:
-        """Brake and refuse set-points."""
+        """Brake and reject set-points."""
         self.is_enabled, self._is_braking = False, True
 
     def tick(self) -> None:
-        """Move on by one tick."""
+        """Advance by one tick."""
         if self._is_braking:
             self._brake()
             return
@@ -80,7 +80,7 @@ class ArmDrive:
             self.is_enabled = False
 
     def _follow(self) -> None:
-        """One tick of the follower; implicit in its damping, so stable for any lookahead."""
+        """Advance the follower by one tick; its damping is implicit, so it is stable for any lookahead."""
         w, dt_s = self._omega, self._dt_s
         pull = self.speed + w * w * dt_s * (self._goal - self.setpoint)
         self.speed = pull / (1.0 + 2.0 * w * dt_s + w * w * dt_s * dt_s)
@@ -96,7 +96,7 @@ class ArmDrive:
 
 @dataclass(slots=True, eq=False)
 class GripperDrive:
-    """Pads on one screw: both move alike, stop at the set force and stay locked there."""
+    """Drive of two pads on one screw: both move equally, stop at the set force, and stay locked there."""
 
     dt_s: float
     width_m: float = START_WIDTH_M
@@ -119,7 +119,7 @@ class GripperDrive:
         if not self.is_moving:
             return
         gap_m = self._target_m - self.width_m
-        # One screw drives both pads, so it feels the mean of their forces.
+        # One screw drives both pads, so it is loaded by the mean of their forces.
         if gap_m < 0.0 and sum(pad_force_n) / 2.0 >= self._force_n:
             self.is_moving, self.is_holding = False, True
             return

@@ -1,4 +1,4 @@
-"""`sim:force_torque`: the wrist sensor, raw: bias, drift, noise, weight of the tool, last digit, end of range."""
+"""`sim:force_torque`: raw wrist sensor with bias, drift, noise, tool weight, resolution and range limit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from simbackend.device import VALID, SimDevice, SimOptions, parse
 FORCE_RANGE_N, TORQUE_RANGE_NM = 300.0, 30.0
 FORCE_DIGIT_N, TORQUE_DIGIT_NM = 0.02, 0.0005
 DRIFT_PERIOD_S = 180.0
-FORCES = np.repeat([1.0, 0.0], 3)  # an injected bias is one of force
+FORCES = np.repeat([1.0, 0.0], 3)  # an injected bias acts on the force only
 
 
 class ForceTorqueOptions(SimOptions):
@@ -33,7 +33,7 @@ class ForceTorqueOptions(SimOptions):
 
 
 class SimForceTorque(SimDevice[Wrench]):
-    """Wrench of the world on the tool, weight and bias inside."""
+    """Wrench that the world exerts on the tool, including tool weight and sensor bias."""
 
     def __init__(self, context: Context, options: ForceTorqueOptions) -> None:
         super().__init__(context, DeviceKind.FORCE_TORQUE, options)
@@ -57,7 +57,7 @@ class SimForceTorque(SimDevice[Wrench]):
         self._range = np.repeat([FORCE_RANGE_N, TORQUE_RANGE_NM], 3)
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        """Range, noise and rate."""
+        """Return range, noise and rate."""
         return ForceTorqueCapabilities(
             force_range_n=FORCE_RANGE_N,
             torque_range_nm=TORQUE_RANGE_NM,

@@ -24,17 +24,17 @@ class SimGripper(SimDevice[GripperState]):
         super().__init__(context, DeviceKind.GRIPPER, options)
 
     def capabilities(self) -> GripperCapabilities:
-        """Range of widths, forces and speeds."""
+        """Return the ranges of width, force and speed."""
         return GripperCapabilities(
             min_width_m=0.0, max_width_m=MAX_WIDTH_M, max_force_n=MAX_FORCE_N, max_speed_m_per_s=MAX_SPEED_M_PER_S
         )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
-        """Newest width and grip."""
+        """Return the newest width and grip."""
         return self._sample(deadline)
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
-        """Start to move; returns the width really commanded.
+        """Start a motion; return the width that was actually commanded.
 
         Raises:
             InvalidRequest: not finite, or force or speed not positive.

@@ -1,4 +1,4 @@
-"""Compiled small steps of the devices that every control tick talks to; a numpy call each would cost ten times more."""
+"""Compiled computations for devices that are used in every control tick; numpy calls would cost ten times more."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from hal.arrays import Array
 
 @njit(cache=True)
 def reachable(wanted: Array, last: Array, stride: Array, lower: Array, upper: Array) -> Any:
-    """The set-point nearest to `wanted` that lies within range and no further than `stride` from the `last` one.
+    """Return the set-point nearest to `wanted` that lies within the range and at most `stride` from the `last` one.
 
-    A drive that woke beyond a limit may come back but go no further out.
+    A drive that starts beyond a limit may come back but may not go further out.
     """
     out = np.empty_like(wanted)
     for k in range(wanted.shape[0]):
@@ -28,7 +28,7 @@ def reachable(wanted: Array, last: Array, stride: Array, lower: Array, upper: Ar
 def raw_wrench(
     true: Array, bias: Array, drift: Array, phase_rad: Array, angle_rad: float, noise: Array, sigma: Array, digit: Array
 ) -> Any:
-    """(6,) what a wrist sensor says: true + bias + drift sin(angle + phase) + sigma noise, to its last digit."""
+    """Return the (6,) sensor reading true + bias + drift sin(angle + phase) + sigma noise, rounded to its resolution."""
     out = np.empty(6)
     for k in range(6):
         raw = true[k] + bias[k] + drift[k] * np.sin(angle_rad + phase_rad[k]) + sigma[k] * noise[k]
@@ -37,8 +37,8 @@ def raw_wrench(
 
 
 def warm_up() -> None:
-    """Compile or load; takes half a minute once on a machine."""
+    """Compile the kernels or load them; the first compilation on a machine takes half a minute."""
     six = np.ones(6)
-    frozen = np.frombuffer(six.tobytes())  # snapshots are read-only views, a type of their own to the compiler
+    frozen = np.frombuffer(six.tobytes())  # snapshots are read-only views, which the compiler treats as a separate type
     reachable(six, frozen, six, six, six)
     raw_wrench(frozen, six, six, six, 1.0, six, six, six)

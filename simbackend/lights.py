@@ -17,21 +17,21 @@ SETTLE_S = 0.02
 
 
 class SimLights(SimDevice[tuple[bool, ...]]):
-    """The four lights of the panel file, in its order."""
+    """Four border lights of the panel file, in its order."""
 
     def __init__(self, context: Context, options: SimOptions) -> None:
         super().__init__(context, DeviceKind.LIGHTS, options)
         self._channels = tuple(light.name for light in self._world.cell.panel.lights)
 
     def capabilities(self) -> LightsCapabilities:
-        """Channels and how long a lamp takes to settle."""
+        """Return the channels and the settling time of a lamp."""
         return LightsCapabilities(channels=self._channels, settle_s=SETTLE_S)
 
     def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
         """Switch all channels with the next step.
 
         Raises:
-            InvalidRequest: not one value a channel.
+            InvalidRequest: the number of values differs from the number of channels.
         """
         self._check(deadline)
         if len(on) != len(self._channels):
@@ -45,11 +45,11 @@ class SimLights(SimDevice[tuple[bool, ...]]):
         return wanted
 
     def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """Newest feedback of each channel."""
+        """Return the newest feedback of each channel."""
         return self._sample(deadline)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[tuple[bool, ...], Quality, Cause]:
-        # A biased feedback line tells the opposite of the truth.
+        # A biased feedback input reports the opposite of the truth.
         return tuple(bool(x) != bool(bias) for x in frame.snapshot.lights_on[: len(self._channels)]), *VALID
 
 

@@ -1,4 +1,4 @@
-"""`sim:range_scanner` with `model = "polar"`: a line scanner that turns steadily, swept by the wrist."""
+"""`sim:range_scanner` with `model = "polar"`: a line scanner that rotates steadily and is swept by the wrist."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from simbackend.client import CameraView, Frame, true_mount
 from simbackend.device import VALID, SimDevice
 from simbackend.range_sensor import MAX_RANGE_M, MIN_RANGE_M, Depth, RangeOptions, corrupt
 
-OVERSAMPLING = 4  # columns of the drawn line per beam; between two of one surface the range is exact
+OVERSAMPLING = 4  # rendered columns per beam; between two columns on one plane the range is exact
 
 
 class SimLineScanner(SimDevice[RangeImage]):
-    """A line scanner on the flange: `width` beams in its x-z plane, `line_rate_hz` turns a second.
+    """Line scanner on the flange: `width` beams in its x-z plane, `line_rate_hz` turns per second.
 
-    While it is recording it measures each beam in the tick that the beam belongs to. A single reading is taken at once,
-    as it would be with the arm at rest.
+    While recording, it measures each beam in the tick that the beam belongs to. A single reading is measured in one
+    tick, as if the arm were at rest.
     """
 
     def __init__(self, context: Context, options: RangeOptions) -> None:
@@ -46,7 +46,7 @@ class SimLineScanner(SimDevice[RangeImage]):
         self._parts: list[Depth] = []
 
     def capabilities(self) -> RangeScannerCapabilities:
-        """Geometry and limits."""
+        """Return geometry and limits."""
         return RangeScannerCapabilities(
             projection="polar",
             width=self._options.width,
@@ -64,7 +64,7 @@ class SimLineScanner(SimDevice[RangeImage]):
         )
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
-        """One line at the present tick."""
+        """Return one line at the present tick."""
         return self._sample(deadline)
 
     def start_recording(self, *, deadline: Deadline) -> None:
@@ -74,7 +74,7 @@ class SimLineScanner(SimDevice[RangeImage]):
         self._await_next_scan(self._world.frame.snapshot.tick)
 
     def end_recording(self, *, deadline: Deadline) -> tuple[Stamped[RangeImage], ...]:
-        """The scans since `start_recording`, oldest first."""
+        """Return the scans since `start_recording`, oldest first."""
         kept, self._kept_scans = self._kept_scans, None
         self._check(deadline)
         return tuple(kept or ())
@@ -87,7 +87,7 @@ class SimLineScanner(SimDevice[RangeImage]):
         return RangeImage(depth_m=corrupt(line_m[np.newaxis, :], self._options, random))
 
     def _line_m(self) -> Depth:
-        """(width,) true range along each beam at the present tick, NaN where it meets nothing."""
+        """Return the (width,) true range along each beam at the present tick, NaN where it meets no surface."""
         _, depth_m = self._world.depth_m(self._view)
         low = np.floor(self._column).astype(int)
         left, right, fraction = depth_m[0, low], depth_m[0, low + 1], self._column - low
@@ -102,13 +102,13 @@ class SimLineScanner(SimDevice[RangeImage]):
 
     @property
     def _beam_ticks(self) -> NDArray[np.int64]:
-        """Ticks before the end of a scan in which each beam is measured, falling to zero."""
+        """Return, for each beam, how many ticks before the end of a scan it is measured; the last is zero."""
         before = np.arange(self._options.width)[::-1] * self._step_rad / math.tau
         ticks: NDArray[np.int64] = np.rint(before * self._world.rate_hz / self._options.line_rate_hz).astype(np.int64)
         return ticks
 
     def _await_next_scan(self, tick: int) -> None:
-        """Plan the ticks of the next scan whose first beam comes after `tick`."""
+        """Schedule the ticks of the next scan whose first beam comes after `tick`."""
         beam_ticks = self._beam_ticks
         period = self._world.rate_hz / self._options.line_rate_hz
         end = round(math.ceil((tick + 1 + beam_ticks[0]) / period) * period)
@@ -116,7 +116,7 @@ class SimLineScanner(SimDevice[RangeImage]):
             self._world.at((end - int(ahead)) / self._world.rate_hz, lambda: self._measure_part(end))
 
     def _measure_part(self, end: int) -> None:
-        """Measure the beams of the present tick; with the last of them the scan is whole."""
+        """Measure the beams of the present tick; the last of them completes the scan."""
         if self._kept_scans is None:
             return
         frame = self._world.frame
@@ -128,7 +128,7 @@ class SimLineScanner(SimDevice[RangeImage]):
         self._await_next_scan(end)
         if self._fault is Fault.STALE:
             return
-        if self._kept is not None:  # frozen
+        if self._kept is not None:  # the device is frozen
             scan = self._kept.value
         else:
             bias = self._magnitude if self._fault is Fault.BIASED else 0.0

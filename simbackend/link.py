@@ -1,4 +1,4 @@
-"""The world process seen from outside: starting it, talking to it, ending it."""
+"""Link to the world process: starts it, exchanges requests and answers, ends it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLOSE_S = 2.0
 
 
 class WorldLink:
-    """One world process and the pipe to it. Requests are fixed vectors; pictures come back through shared memory."""
+    """One world process and the pipe to it. Requests are fixed vectors; pictures return through shared memory."""
 
     def __init__(self, config: WorldConfig) -> None:
         self._lock = threading.RLock()
@@ -49,7 +49,7 @@ class WorldLink:
             raise
 
     def _greet(self, config: WorldConfig) -> bytes:
-        """Send the config; returns the first snapshot."""
+        """Send the configuration; return the first snapshot."""
         try:
             self._pipe.send(config)
             complaint = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
@@ -64,19 +64,19 @@ class WorldLink:
         )
 
     def step(self, request: bytes) -> bytes:
-        """Obey a step request; returns the snapshot's bytes."""
+        """Send a step request; return the bytes of the snapshot."""
         with self._lock, self._guarded():
             os.write(self._stream, request)
             return read_exactly(self._stream, SNAPSHOT * DOUBLE)
 
     def ask(self, op: Op, *arguments: float) -> Any:
-        """Any other request; returns the object that comes back."""
+        """Send any other request; return the object in the answer."""
         with self._lock, self._guarded():
             os.write(self._stream, _vector(op, *arguments))
             return self._pipe.recv()
 
     def picture(self, arguments: list[float], shape: tuple[int, ...]) -> tuple[Any, NDArray[np.float32]]:
-        """What a picture request says and draws."""
+        """Return the description and the pixels that a picture request yields."""
         with self._lock:
             info = self.ask(Op.RENDER, *arguments)
             return info, np.frombuffer(self._images, np.float32, int(np.prod(shape))).reshape(shape).copy()
@@ -118,5 +118,5 @@ def _vector(op: Op, *arguments: float) -> bytes:
 
 
 def _environment() -> dict[str, str]:
-    """The world uses one core, because the other belongs to the cell."""
+    """Return the environment that limits the world to one core, because the other is for the cell."""
     return {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")}

@@ -1,7 +1,7 @@
-"""How the moving parts of a panel resist a finger: friction, springs, latches, detents. One joint each.
+"""Resistance of the moving parts of a panel: friction, springs, latches, detents. One joint each.
 
-A mechanism is `drive`n every tick while the tool is near; far away it is locked, which saves time and changes nothing.
-`engine` is a connected PyBullet client; this file never imports the module, so that only the world process loads it.
+`drive` is called every tick while the tool is near; otherwise the mechanism is locked, which saves time and changes
+nothing. `engine` is a connected PyBullet client; this file never imports PyBullet, so only the world process loads it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SNAP_GAIN_PER_S = 40.0
 
 
 class Mechanism(Protocol):
-    """A part with one joint."""
+    """Part with one joint."""
 
     body: int
 
@@ -33,7 +33,7 @@ class Mechanism(Protocol):
         ...
 
     def place(self) -> float:
-        """Present joint position, rad or m."""
+        """Return the present joint position, rad or m."""
         ...
 
 
@@ -47,25 +47,25 @@ class Friction:
     damping: float = 0.0  # N m s/rad or N s/m
 
     def __post_init__(self) -> None:
-        # The engine's stop catches a part only after the tick in which it passed: damping keeps it from racing.
+        # The engine's stop acts only after the tick in which a part has passed it, so damping limits its speed.
         self.engine.changeDynamics(self.body, JOINT, jointDamping=self.damping)
 
     def lock(self) -> None:
-        """Friction is its own lock."""
+        """Do nothing: friction holds the part."""
         self.drive()
 
     def drive(self) -> None:
-        """A velocity motor at rest with limited effort breaks away within 5 % of that effort."""
+        """Brake with a velocity motor at zero speed and limited effort, which breaks away within 5 % of that effort."""
         _hold(self.engine, self.body, speed=0.0, effort=self.effort)
 
     def place(self) -> float:
-        """Joint position."""
+        """Return the joint position."""
         return float(self.engine.getJointState(self.body, JOINT)[0])
 
 
 @dataclass(slots=True, eq=False)
 class Spring:
-    """Push button: spring, preload, travel; when `latching`, a push sets a latch and (`releases`) another frees it.
+    """Push button: spring, preload, travel; when `latching`, a push sets a latch and (`releases`) another releases it.
 
     The joint runs from 0 (out) to -travel (in).
     """
@@ -86,11 +86,11 @@ class Spring:
         _hold(self.engine, self.body, speed=0.0, effort=LOCK_EFFORT)
 
     def free(self) -> None:
-        """Let go of the cap, so that `drive` alone moves it."""
+        """Release the cap, so that `drive` alone moves it."""
         _hold(self.engine, self.body, speed=0.0, effort=0.0)
 
     def drive(self) -> None:
-        """Spring force k x + preload outwards, viscous damping, and the switch."""
+        """Apply the spring force k x + preload outwards and viscous damping, and update the switch."""
         x, v = self.engine.getJointState(self.body, JOINT)[:2]
         self._switch(x)
         rest_m = -self.latched_depth_m if self.is_latched else 0.0
@@ -101,7 +101,7 @@ class Spring:
 
     @property
     def latched_depth_m(self) -> float:
-        """How far a latched cap stays in."""
+        """Return how deep a latched cap stays."""
         return LATCHED_SHARE * self.travel_m
 
     def _switch(self, x: float) -> None:
@@ -115,15 +115,16 @@ class Spring:
             self.is_in = False
 
     def place(self) -> float:
-        """Joint position."""
+        """Return the joint position."""
         return float(self.engine.getJointState(self.body, JOINT)[0])
 
 
 @dataclass(slots=True, eq=False)
 class Detent:
-    """Rests in the nearest of several places: toggle (two) and rotary selector. Turning it away costs `effort`.
+    """Rests in the nearest of several places: toggle (two) and rotary selector. Turning it away requires `effort`.
 
-    A velocity motor aims at the nearest place, so the breakaway effort is `effort` at every angle, and nothing rings.
+    A velocity motor moves to the nearest place, so the breakaway effort is `effort` at every angle and nothing
+    oscillates.
     """
 
     engine: Any
@@ -133,25 +134,25 @@ class Detent:
     max_speed: float
 
     def lock(self) -> None:
-        """A detent is its own lock: go on aiming at the nearest place."""
+        """Continue to move to the nearest place, which holds the part."""
         self.drive()
 
     def drive(self) -> None:
-        """Aim at the nearest place."""
+        """Move to the nearest place."""
         x = self.place()
         error = self.nearest(x) - x
         speed = max(-self.max_speed, min(self.max_speed, SNAP_GAIN_PER_S * error))
         _hold(self.engine, self.body, speed=speed, effort=self.effort)
 
     def nearest(self, x: float) -> float:
-        """The resting place next to `x`."""
+        """Return the resting place nearest to `x`."""
         return min(self.places, key=lambda place: abs(place - x))
 
     def place(self) -> float:
-        """Joint position."""
+        """Return the joint position."""
         return float(self.engine.getJointState(self.body, JOINT)[0])
 
 
 def _hold(engine: Any, body: int, *, speed: float, effort: float) -> None:
-    """A velocity motor with limited effort: friction, brake or snap, as its speed and effort say."""
+    """Set a velocity motor with limited effort, which acts as friction, brake or snap depending on speed and effort."""
     engine.setJointMotorControl2(body, JOINT, engine.VELOCITY_CONTROL, targetVelocity=speed, force=effort)

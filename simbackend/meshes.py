@@ -1,4 +1,4 @@
-"""Triangle soups of the shapes that the cell is made of: vertices, vertex normals, texture coordinates."""
+"""Triangle meshes of the cell's shapes: vertices, vertex normals, texture coordinates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ DISC = 72
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mesh:
-    """T triangles: `points_m` and `normals` (T, 3, 3), `uv` (T, 3, 2) with v upwards; from outside they turn left."""
+    """T triangles: `points_m` and `normals` (T, 3, 3), `uv` (T, 3, 2) with v upwards.
+
+    Counter-clockwise seen from outside.
+    """
 
     points_m: Array
     normals: Array
@@ -23,7 +26,7 @@ class Mesh:
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
-    """All triangles in one mesh."""
+    """Return all triangles in one mesh."""
     return Mesh(
         points_m=np.concatenate([mesh.points_m for mesh in meshes]),
         normals=np.concatenate([mesh.normals for mesh in meshes]),
@@ -32,12 +35,12 @@ def merge(meshes: list[Mesh]) -> Mesh:
 
 
 def placed(mesh: Mesh, rotation: Array, translation_m: Array) -> Mesh:
-    """The mesh in the parent's axes."""
+    """Return the mesh in the parent's axes."""
     return Mesh(points_m=mesh.points_m @ rotation.T + translation_m, normals=mesh.normals @ rotation.T, uv=mesh.uv)
 
 
 def box(size_m: Array) -> Mesh:
-    """A box with its middle at the origin."""
+    """Return a box centred at the origin."""
     faces = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
@@ -50,7 +53,7 @@ def box(size_m: Array) -> Mesh:
 
 
 def cylinder(radius_m: float, length_m: float) -> Mesh:
-    """A cylinder along z with its middle at the origin."""
+    """Return a cylinder along z centred at the origin."""
     count = _corners(radius_m)
     ring = _ring(count)
     low = np.column_stack([radius_m * ring, np.full(count, -length_m / 2)])
@@ -66,7 +69,7 @@ def cylinder(radius_m: float, length_m: float) -> Mesh:
 
 
 def sphere(radius_m: float) -> Mesh:
-    """A ball with its middle at the origin."""
+    """Return a sphere centred at the origin."""
     count = _corners(radius_m)
     rows = count // 2
     latitude = np.pi * (np.arange(rows + 1) / rows - 0.5)
@@ -82,12 +85,12 @@ def sphere(radius_m: float) -> Mesh:
 
 
 def _corners(radius_m: float) -> int:
-    # The arm is large, but only ever a shadow at the edge of a picture.
+    # The arm is large, but appears only as a shadow at the edge of a picture.
     return MANY if FINE_M < radius_m < 0.04 else FEW
 
 
 def flat(size_m: tuple[float, float], *, is_round: bool) -> Mesh:
-    """A flat picture in z = 0 facing +z; a rectangle or the disc inside it."""
+    """Return a flat picture in z = 0 facing +z; a rectangle or the disc inside it."""
     corners = _ring(DISC) if is_round else np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     points = np.column_stack([corners * np.asarray(size_m) / 2.0, np.zeros(len(corners))])
     return _fan(points, np.tile([0.0, 0.0, 1.0], (len(corners), 1)), (corners + 1.0) / 2.0)
@@ -99,7 +102,7 @@ def _ring(count: int) -> Array:
 
 
 def _fan(corners: Array, normals: Array, uv: Array | None = None) -> Mesh:
-    """The triangles of a convex polygon."""
+    """Return the triangles of a convex polygon."""
     uv = np.zeros((len(corners), 2)) if uv is None else uv
     index = np.array([[0, i, i + 1] for i in range(1, len(corners) - 1)])
     return Mesh(points_m=corners[index], normals=normals[index], uv=uv[index])

@@ -1,4 +1,4 @@
-"""The panel inside the engine: bodies, printed faces, lamps, mechanisms, and what they truly show."""
+"""The panel inside the engine: bodies, printed faces, lamps, mechanisms, and their true states."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from simbackend.scene import Scene
 from simbackend.urdf import Colour
 from simbackend.wire import Emitter
 
-NEAR_M = 0.14  # a mechanism is alive while the finger tips are nearer than this
-# Parts of the panel never collide with one another (a button sinks into its plate), only with the arm.
+NEAR_M = 0.14  # mechanisms are active while the finger tips are nearer than this
+# Parts of the panel collide with the arm only, never with one another (a button moves into its plate).
 ARM_GROUP, PANEL_GROUP = 1, 2
 LENS = 0  # the link of a border light that shines
 LIGHT_GLOW = (1.0, 0.97, 0.88)
 LIGHT_OFF = (0.42, 0.42, 0.40)
 DIM = 0.35
-LAMP_RADIANCE = 3.2  # a lit red lamp has to outshine the plate in a grey image too
+LAMP_RADIANCE = 3.2  # a lit red lamp must be brighter than the plate in a grey image too
 LIGHT_RADIANCE = 5.0
 GLOW: dict[str, tuple[float, float, float]] = {
     "red": (1.0, 0.12, 0.08),
@@ -41,7 +41,7 @@ GLOW: dict[str, tuple[float, float, float]] = {
 
 
 class PanelWorld:
-    """All bodies of the panel and the room behind it."""
+    """All bodies of the panel, and the room behind it."""
 
     def __init__(self, engine: Any, cell: Cell, draws: Draws, folder: Path) -> None:
         self.engine = engine
@@ -87,7 +87,7 @@ class PanelWorld:
     # -- building -------------------------------------------------------------------------------------------------
 
     def _load_room(self, floor_z_m: float) -> None:
-        """The floor that the arm stands on."""
+        """Load the floor that the arm stands on."""
         engine = self.engine
         floor = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05])
         look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05], rgbaColor=[0.28, 0.29, 0.30, 1])
@@ -106,7 +106,7 @@ class PanelWorld:
         self._pictures.append((picture, self.base_from_panel))
 
     def _load_cable(self, number: int, cable: CableSection) -> None:
-        """Stiff rods from point to point, round at the joints."""
+        """Load a cable as stiff rods from point to point, with spheres at the joints."""
         engine, radius = self.engine, cable.radius_m
         colour = [cable.gray] * 3 + [1]
         ball = engine.createCollisionShape(engine.GEOM_SPHERE, radius=radius)
@@ -123,13 +123,13 @@ class PanelWorld:
             self.bodies[f"_cable{number}_rod{k}"] = engine.createMultiBody(0, rod, look, place, turn.as_quat().tolist())
 
     def _keep_apart(self) -> None:
-        """Let the bodies of room and panel touch the arm and nothing else."""
+        """Restrict collisions of room and panel to those with the arm."""
         for body in range(self._first_body, self.engine.getNumBodies()):
             for link in range(-1, self.engine.getNumJoints(body)):
                 self.engine.setCollisionFilterGroupMask(body, link, PANEL_GROUP, ARM_GROUP)
 
     def _draw_up(self) -> Scene:
-        """Everything to see: all bodies of the engine (the arm too) and the printed faces."""
+        """Return the scene of everything visible: all bodies of the engine (with the arm) and the printed faces."""
         scene = Scene(self.engine)
         for body in range(self.engine.getNumBodies()):
             scene.add_body(body)
@@ -170,14 +170,14 @@ class PanelWorld:
         if self.engine.getNumJoints(body):
             self.engine.resetJointState(body, JOINT, model.place)
             for link in (-1, JOINT):
-                # The pads' own friction factor multiplies this one.
+                # The engine multiplies this by the pads' own friction coefficient.
                 self.engine.changeDynamics(body, link, lateralFriction=1.0, jointDamping=0.0)
             self.mechanisms[name] = body_kind.mechanism(
                 self.engine, body, built.panel_object, built.start, built.effort_ratio
             )
 
     def object_pose(self, built: Built) -> RigidTransform:
-        """base_from_object as built."""
+        """Return base_from_object as built."""
         x, y = built.panel_object.position_m
         dx, dy = built.offset_m
         return self.base_from_panel * RigidTransform.from_translation([x + dx, y + dy, 0.0])
@@ -185,7 +185,7 @@ class PanelWorld:
     # -- running --------------------------------------------------------------------------------------------------
 
     def wake(self, tip_m: tuple[float, float, float]) -> None:
-        """Let the mechanisms round the finger tips live; the others stay locked."""
+        """Activate the mechanisms near the finger tips; the others stay locked."""
         x, y, z = tip_m
         near = {
             name
@@ -196,7 +196,7 @@ class PanelWorld:
             self._wake(near)
 
     def drive(self) -> None:
-        """One tick of the mechanisms that are alive."""
+        """Drive the active mechanisms for one tick."""
         for name in self._order:
             mechanism = self.mechanisms[name]
             if isinstance(mechanism, Spring):
@@ -216,7 +216,7 @@ class PanelWorld:
         self._order = sorted(near)
 
     def _work_lamp(self, name: str, button: Spring) -> None:
-        """Each press of a button turns its lamp over."""
+        """Toggle the lamp at each press of its button."""
         if button.presses == self._presses[name]:
             return
         self._presses[name] = button.presses
@@ -237,14 +237,14 @@ class PanelWorld:
         self.scene.shine(body, link, on=on)
 
     def switch_lights(self, on: list[bool]) -> None:
-        """Border lights, in the order of the panel file."""
+        """Switch the border lights, in the order of the panel file."""
         for i, (light, lit) in enumerate(zip(self.panel.lights, on, strict=True)):
             if bool(self.lights_on[i]) != lit:
                 self.lights_on[i] = float(lit)
                 self._paint(light.name, LIGHT_GLOW if lit else LIGHT_OFF, LIGHT_RADIANCE if lit else 1.0, on=lit)
 
     def emitters(self) -> tuple[Emitter, ...]:
-        """Everything that shines now."""
+        """Return everything that shines now."""
         lit = [
             Emitter(colour=LIGHT_GLOW, position_m=place, radius_m=light.radius_m, is_border_light=True)
             for light, place, on in zip(self.panel.lights, self._light_places, self.lights_on, strict=True)
@@ -265,7 +265,7 @@ class PanelWorld:
         return tuple(lit)
 
     def truth(self) -> tuple[ObjectTruth, ...]:
-        """What each object shows at this tick: for the judge."""
+        """Return the true state of each object at this tick, for the judge."""
         return tuple(
             body_of(built.panel_object.kind).truth(
                 built.panel_object, built.start, self.mechanisms.get(name), is_lit=self.lamps_on.get(name, False)

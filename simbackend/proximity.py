@@ -27,7 +27,7 @@ class ProximityOptions(SimOptions):
 
 
 class SimProximity(SimDevice[float]):
-    """Distance along the sensor's z axis, from a narrow cone of rays."""
+    """Distance along the sensor's z axis, measured with a narrow cone of rays."""
 
     def __init__(self, context: Context, options: ProximityOptions) -> None:
         super().__init__(context, DeviceKind.PROXIMITY, options)
@@ -40,7 +40,7 @@ class SimProximity(SimDevice[float]):
         self._index = self._world.proximity.index(context.name)
 
     def capabilities(self) -> ProximityCapabilities:
-        """Range, noise and rate."""
+        """Return range, noise and rate."""
         return ProximityCapabilities(
             min_range_m=MIN_RANGE_M,
             max_range_m=PROXIMITY_RANGE_M,
@@ -59,7 +59,7 @@ class SimProximity(SimDevice[float]):
         true_m = float(frame.snapshot.distance_m[self._index])
         noise_m = self._options.sigma_m * float(self._noise.at(frame.snapshot.distance_tick)[0])
         distance_m = true_m + noise_m + bias
-        if not MIN_RANGE_M <= distance_m <= PROXIMITY_RANGE_M:  # NaN is out of range too
+        if not MIN_RANGE_M <= distance_m <= PROXIMITY_RANGE_M:  # also true for NaN
             return math.nan, Quality.INVALID, Cause.OUT_OF_RANGE
         step_m = self._options.resolution_m
         return round(distance_m / step_m) * step_m, *VALID

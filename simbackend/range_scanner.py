@@ -1,4 +1,4 @@
-"""`sim:range_scanner`: a pinhole range image from the engine's depth buffer, with what a real scanner does to it."""
+"""`sim:range_scanner`: a pinhole range image from the depth buffer, with the errors of a real scanner."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SimRangeScanner(SimDevice[RangeImage]):
         self._newest: tuple[int, float, RangeImage] | None = None
 
     def capabilities(self) -> RangeScannerCapabilities:
-        """Geometry and limits."""
+        """Return geometry and limits."""
         view = self._view
         return RangeScannerCapabilities(
             projection="pinhole",
@@ -54,7 +54,7 @@ class SimRangeScanner(SimDevice[RangeImage]):
         )
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
-        """The range image of the present tick."""
+        """Return the range image of the present tick."""
         return self._sample(deadline)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[RangeImage, Quality, Cause]:

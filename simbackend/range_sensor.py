@@ -1,4 +1,4 @@
-"""What every simulated range scanner does to a true depth: options, noise, mixed and lost pixels."""
+"""Errors of every simulated range scanner: options, noise, mixed and lost pixels."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ JUMP_M = 0.008  # neighbours further apart than this share a beam
 class RangeOptions(SimOptions):
     """Size, field of view and corruption.
 
-    `model = "polar"` is a line scanner of `width` beams that turns `line_rate_hz` times a second, to be swept by the wrist.
-    `sigma_m`: noise at 0.5 m, growing with the square of the distance. `bits` = 8 quantises the range from 0.10 to
-    1.50 m to 256 steps as the paper's scanner did. `mixed_ratio` of the pixels at a jump report a depth between the
+    `model = "polar"` is a line scanner of `width` beams that turns `line_rate_hz` times a second, to be swept by the
+    wrist. `sigma_m`: noise at 0.5 m, growing with the square of the distance. `bits` = 8 quantises the range from 0.10
+    to 1.50 m to 256 steps as the paper's scanner did. `mixed_ratio` of the pixels at a jump report a depth between the
     two surfaces, and `loss_ratio` of all pixels see nothing.
     """
 
@@ -38,7 +38,7 @@ class RangeOptions(SimOptions):
 
 
 def corrupt(depth_m: Depth, options: RangeOptions, random: np.random.Generator) -> Depth:
-    """Mixed pixels at jumps, noise growing with the square of the distance, lost pixels, range limits, last digit."""
+    """Return the depth with mixed pixels at jumps, noise, lost pixels, range limits and quantisation."""
     seen = np.where(np.isfinite(depth_m), depth_m, np.float32(2.0 * MAX_RANGE_M))
     kernel = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(seen, kernel), cv2.dilate(seen, kernel)

@@ -1,9 +1,9 @@
-"""A small z-buffer rasteriser: exact pinhole pictures of textured triangles.
+"""Small z-buffer rasteriser: exact pinhole pictures of textured triangles.
 
-PyBullet's own renderer takes 200 ns a pixel even when it sees nothing (0.3 s for one anti-aliased 640x480 image on one
-core); this one takes a tenth of that and puts pixel (u, v) exactly on the ray through (u, v).
+PyBullet's own renderer takes 200 ns per pixel even for an empty scene (0.3 s per anti-aliased 640x480 image on one
+core); this one takes a tenth of that and places pixel (u, v) exactly on the ray through (u, v).
 
-The kernel walks each triangle row by row. Over a plane, 1/z and every attribute/z are linear in the pixel (Blinn,
+The kernel fills each triangle row by row. Over a plane, 1/z and every attribute/z are linear in the pixel (Blinn,
 "Hyperbolic interpolation", IEEE CG&A 12(4), 1992).
 """
 
@@ -43,7 +43,7 @@ def rasterise(  # a compiled kernel takes no keywords
         attributes: (T, 3, 3) shade, u, v of each corner.
         surface: (T,) row of `table` for a textured triangle, -1 for plain `albedo`.
         albedo: (T, C) colour of the triangle; multiplies shade, or shade and texture.
-        texels: all textures' bytes, C to a texel, one after another.
+        texels: all textures' bytes, C per texel, one after another.
         table: (N, 4) offset, width, height and number of halved copies of each texture.
         camera: fx, fy, cx, cy, near_m.
     """
@@ -61,11 +61,11 @@ def rasterise(  # a compiled kernel takes no keywords
 
 @njit(cache=True, nogil=True)
 def _is_behind(triangle: Array, near: float) -> bool:
-    """Does the triangle show its back, or lie wholly before the near plane?"""
+    """Return whether the triangle faces away from the camera or lies entirely before the near plane."""
     a, b, c = triangle[0], triangle[1], triangle[2]
     if a[2] < near and b[2] < near and c[2] < near:
         return True
-    # (b - a) x (c - a) . a: the plane's side that the camera, at the origin, is on.
+    # (b - a) x (c - a) . a: the side of the plane on which the camera, at the origin, lies.
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     side = a[0] * (uy * vz - uz * vy) + a[1] * (uz * vx - ux * vz) + a[2] * (ux * vy - uy * vx)
@@ -74,7 +74,7 @@ def _is_behind(triangle: Array, near: float) -> bool:
 
 @njit(cache=True, nogil=True)
 def _clip(triangle: Array, values: Array, near: float, corner: Array, out: Array) -> int:
-    """The part of a triangle beyond the near plane: 0, 3 or 4 corners."""
+    """Clip a triangle to the part beyond the near plane; return its number of corners: 0, 3 or 4."""
     count = 0
     for i in range(3):
         j = (i + 1) % 3
@@ -105,7 +105,7 @@ def _triangle(
     inverse_depth: Float32,
     image: Float32,
 ) -> None:
-    """Draw corners 0, k and k + 1 row by row."""
+    """Draw the triangle of corners 0, k and k + 1 row by row."""
     height, width = inverse_depth.shape
     channels = image.shape[2]
     index = (0, k, k + 1)
@@ -147,13 +147,13 @@ def _triangle(
 
 @njit(cache=True, nogil=True)
 def _project(corner: Array, index: tuple[int, int, int], camera: Array, x: Array, y: Array, w: Array) -> float:
-    """Fill pixel coordinates and 1/z of the three corners; twice the area in the picture, negative for a back."""
+    """Fill pixel coordinates and 1/z of the three corners; return twice the area, negative for a back face."""
     for i in range(3):
         p = corner[index[i]]
         w[i] = 1.0 / p[2]
         x[i] = camera[0] * p[0] * w[i] + camera[2]
         y[i] = camera[1] * p[1] * w[i] + camera[3]
-    # Camera axes have y down, so a front face, which turns left in space, turns right in the picture.
+    # Camera axes have y down, so a front face, counter-clockwise in space, is clockwise in the picture.
     return float((x[2] - x[0]) * (y[1] - y[0]) - (x[1] - x[0]) * (y[2] - y[0]))
 
 
@@ -161,7 +161,7 @@ def _project(corner: Array, index: tuple[int, int, int], camera: Array, x: Array
 def _slopes(
     values: Array, index: tuple[int, int, int], x: Array, y: Array, w: Array, area: float, plane: Array
 ) -> None:
-    """Rows of `plane`: value at pixel (0, 0), slope along x, slope along y; of 1/z and of each attribute over z."""
+    """Fill the rows of `plane`: value at pixel (0, 0), slopes along x and y, for 1/z and each attribute over z."""
     for a in range(1 + ATTRIBUTES):
         f0 = w[0] if a == 0 else values[index[0], a - 1] * w[0]
         f1 = w[1] if a == 0 else values[index[1], a - 1] * w[1]
@@ -173,11 +173,11 @@ def _slopes(
 
 @njit(cache=True, nogil=True, inline="always")
 def _columns(row: int, x: Array, y: Array, width: int) -> tuple[int, int]:
-    """First and last pixel of a row inside the triangle; none when the first is beyond the last."""
+    """Return the first and last pixel of a row inside the triangle; the first is beyond the last if there is none."""
     left, right = 0.0, width - 1.0
     for i in range(3):
         j = (i + 1) % 3
-        # Inside is where (p - p_i) x (p_j - p_i) >= 0.
+        # A point is inside where (p - p_i) x (p_j - p_i) >= 0.
         ey = y[j] - y[i]
         rest = (row - y[i]) * (x[j] - x[i])
         if ey > 0.0:
@@ -203,7 +203,7 @@ def _texture(
     row: int,
     column: int,
 ) -> None:
-    """Fill a pixel's channels from the four texels around (u, v), in texels."""
+    """Fill a pixel's channels by interpolation of the four texels around (u, v), in texels."""
     channels = image.shape[2]
     u = min(max(u, 0.0), tw - 1.0)
     v = min(max(v, 0.0), th - 1.0)
@@ -221,7 +221,7 @@ def _texture(
 def _level(
     values: Array, index: tuple[int, int, int], area: float, entry: NDArray[np.int64], channels: int
 ) -> tuple[int, int, int]:
-    """Offset and size of the halved copy whose texels are about as large as a pixel of this triangle."""
+    """Return offset and size of the halved copy whose texels are about as large as a pixel of this triangle."""
     offset, tw, th = entry[0], entry[1], entry[2]
     a, b, c = values[index[0]], values[index[1]], values[index[2]]
     texel_area = abs((b[1] - a[1]) * (c[2] - a[2]) - (c[1] - a[1]) * (b[2] - a[2])) * tw * th

@@ -1,6 +1,6 @@
-"""Everything there is to see, as triangles by moving part, and pictures of it.
+"""Everything visible, as triangles per moving part, and pictures of it.
 
-The shapes are read back from the engine, so what is drawn is what was loaded; printed faces are added beside them.
+The shapes are read back from the engine, so what is rendered is what was loaded; printed faces are added.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from simbackend.raster import rasterise
 Float32 = NDArray[np.float32]
 Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position and quaternion, as the engine gives them
 
-TO_LIGHT = np.array([-0.50, 0.30, 0.81])  # base axes: the room's lamps hang above and behind the arm
+TO_LIGHT = np.array([-0.50, 0.30, 0.81])  # base axes: the room lamps are above and behind the arm
 AMBIENT, DIFFUSE = 0.55, 0.50
 BACKGROUND = 0.16
 HALVINGS = 3
@@ -39,7 +39,7 @@ class _Part:
 
 
 class Scene:
-    """Collects triangles once and draws them where they are now."""
+    """Collects triangles once and renders them at their present poses."""
 
     def __init__(self, engine: Any) -> None:
         self._engine = engine
@@ -52,7 +52,7 @@ class Scene:
         self._compiled: dict[int, _Compiled] = {}
 
     def add_body(self, body: int) -> None:
-        """All visual shapes of a body of the engine."""
+        """Add all visual shapes of a body of the engine."""
         for entry in self._engine.getVisualShapeData(body):
             _, link, kind, size, _, position, quaternion, rgba = entry[:8]
             mesh = self._shape(kind, size)
@@ -62,7 +62,7 @@ class Scene:
     def add_picture(
         self, pixels: Pixels, size_m: tuple[float, float], base_from_picture: RigidTransform, *, is_round: bool
     ) -> None:
-        """A printed face that never moves."""
+        """Add a printed face that never moves."""
         mesh = meshes.flat(size_m, is_round=is_round)
         turn = np.asarray(base_from_picture.rotation.as_matrix())
         self._pictures.append(pixels)
@@ -103,14 +103,14 @@ class Scene:
             self._compiled[channels] = _Compiled(self._albedo, self._pictures, channels)
 
     def paint(self, body: int, link: int, colour: tuple[float, float, float]) -> None:
-        """Give a link (-1: the base) another colour; more than 1 shines."""
+        """Give a link (-1: the base) another colour; values above 1 shine."""
         for part in self._parts:
             if (part.body, part.link) == (body, link):
                 for compiled in self._compiled.values():
                     compiled.albedo[part.rows] = compiled.mix(np.asarray(colour))
 
     def shine(self, body: int, link: int, *, on: bool) -> None:
-        """What shines looks alike from all sides."""
+        """Set whether a link shines; a shining link is equally bright from all sides."""
         for part in self._parts:
             if (part.body, part.link) == (body, link):
                 self._glow[part.rows] = on
@@ -127,7 +127,7 @@ class Scene:
         near_m: float,
         channels: int,
     ) -> tuple[Float32, Float32]:
-        """Radiance (H, W, channels), white = 1, and 1/depth (H, W) in 1/m, 0 where there is nothing.
+        """Return radiance (H, W, channels), white = 1, and 1/depth (H, W) in 1/m, 0 where there is no surface.
 
         `channels`: 3 for RGB, 1 for grey, 0 for depth alone.
         """
@@ -152,7 +152,7 @@ class Scene:
         return image, inverse_depth
 
     def _follow(self) -> None:
-        """Move the triangles of every link that has moved since the last picture."""
+        """Update the triangles of every link that has moved since the last picture."""
         for key, all_rows in self._links.items():
             pose = self._pose(*key)
             if self._last.get(key) == pose:
@@ -174,13 +174,13 @@ class Scene:
 
 
 def _shade(normals: Array) -> Array:
-    """(T, 3) light on each corner: the room's, and what a distant lamp adds by the cosine."""
+    """Return the (T, 3) light on each corner: ambient light, plus a distant lamp by the cosine law."""
     towards = TO_LIGHT / np.linalg.norm(TO_LIGHT)
     return np.asarray(AMBIENT + DIFFUSE * np.maximum(normals @ towards, 0.0))
 
 
 class _Compiled:
-    """Colours and textures for a number of channels; each texture lies beside smaller copies of itself."""
+    """Colours and textures for a number of channels; each texture is stored with its reduced copies."""
 
     def __init__(self, albedo: Array, pictures: list[Pixels], channels: int) -> None:
         self._channels = channels
@@ -197,9 +197,9 @@ class _Compiled:
                 half = (level.shape[1] // 2, level.shape[0] // 2)
                 level = np.asarray(cv2.resize(level, half, interpolation=cv2.INTER_AREA), np.uint8)
         self.texels = np.concatenate(texels) if texels else np.zeros(1, np.uint8)
-        # A depth picture needs no texture, but the rows must exist that its triangles point to.
+        # A depth picture needs no texture, but the rows that its triangles refer to must exist.
         self.table = np.array(table or [(0, 2, 2, 0)] * max(1, len(pictures)), np.int64)
 
     def mix(self, colour: Array) -> Array:
-        """RGB as this many channels."""
+        """Return an RGB colour in this number of channels."""
         return colour if self._channels == 3 else np.array([float(colour @ LUMA)])[: self._channels]

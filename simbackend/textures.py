@@ -1,4 +1,4 @@
-"""What is printed on the plate: ground, labels, and what stands about each control."""
+"""Print on the plate: background, labels, and marks around each control."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PLATE_PX_PER_M = 2600.0
 
 
 def plate(panel: Panel) -> Pixels:
-    """The plate: ground, labels, and what is printed about each object and light."""
+    """Return the plate: background, labels, and the print around each object and light."""
     canvas = Canvas(panel.width_m, panel.height_m, PLATE_PX_PER_M, PLATE)
     for panel_object in panel.objects:
         body_of(panel_object.kind).print_on(canvas, panel_object)

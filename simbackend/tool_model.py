@@ -1,4 +1,4 @@
-"""What hangs below the flange: force/torque sensor, parallel gripper, two slim fingers.
+"""Tool below the flange: force/torque sensor, parallel gripper, two slim fingers.
 
 Grip frame: origin between the finger tips at the tip end, z forward along the fingers, x the closing direction. Each
 finger is 7 mm thick (x), 12 mm wide (y) and 75 mm long: closed, they make a 14 x 12 mm fingertip for buttons and
@@ -27,10 +27,13 @@ STEEL = (0.55, 0.57, 0.60)
 
 
 def tool_urdf(*, flange_from_sensor: RigidTransform, flange_from_grip: RigidTransform, load_kg: float) -> list[str]:
-    """URDF lines of the tool. `load_kg`: all below the sensor; the gripper's body gets what the rest leaves."""
+    """Return the URDF lines of the tool.
+
+    `load_kg` is all mass below the sensor, and the gripper's body gets the remainder.
+    """
     sensor_from_grip = flange_from_sensor.inv() * flange_from_grip
     body_kg = load_kg - SENSOR_MASS_KG - 2.0 * FINGER_MASS_KG
-    # The sensor's own centre of mass lies in its origin: PyBullet reports the reaction there.
+    # The sensor's own centre of mass lies at its origin, because PyBullet reports the reaction there.
     lines = link(
         "sensor",
         inertial(SENSOR_MASS_KG, (0, 0, 0), (1e-5,) * 3),

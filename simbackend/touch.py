@@ -23,18 +23,18 @@ class TouchOptions(SimOptions):
 
 
 class SimTouch(SimDevice[Contacts]):
-    """Two channels: left and right finger."""
+    """Contact switches with two channels: left and right finger."""
 
     def __init__(self, context: Context, options: TouchOptions) -> None:
         super().__init__(context, DeviceKind.TOUCH, options)
         self._threshold_n = options.threshold_n
 
     def capabilities(self) -> TouchCapabilities:
-        """Channels and threshold."""
+        """Return channels and threshold."""
         return TouchCapabilities(channels=("left", "right"), threshold_n=self._threshold_n, rate_hz=self._world.rate_hz)
 
     def read_contacts(self, *, deadline: Deadline) -> Stamped[Contacts]:
-        """Newest state of each channel."""
+        """Return the newest state of each channel."""
         return self._sample(deadline)
 
     def _measure(self, frame: Frame, bias: float) -> tuple[Contacts, Quality, Cause]:

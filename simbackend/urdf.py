@@ -1,4 +1,4 @@
-"""URDF text from primitives. One tag a line, because PyBullet's parser cuts lines of more than about 1 kB."""
+"""URDF text from primitives. One tag per line, because PyBullet's parser truncates lines of more than about 1 kB."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Colour = tuple[float, float, float]
 
 
 def origin(pose: RigidTransform) -> str:
-    """The `<origin>` tag of a pose."""
+    """Return the `<origin>` tag of a pose."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # at gimbal lock one of many right answers is good enough
+        warnings.simplefilter("ignore", UserWarning)  # at gimbal lock any of the equivalent solutions will do
         rpy = pose.rotation.as_euler("xyz")
     return f'<origin xyz="{_numbers(pose.translation)}" rpy="{_numbers(rpy)}"/>'
 
 
 def inertial(mass_kg: float, centre_m: Sequence[float], inertia_kg_m2: Sequence[float]) -> list[str]:
-    """Mass, centre and principal inertia of a link."""
+    """Return mass, centre and principal inertia of a link."""
     xx, yy, zz = inertia_kg_m2
     return [
         "<inertial>",
@@ -32,24 +32,24 @@ def inertial(mass_kg: float, centre_m: Sequence[float], inertia_kg_m2: Sequence[
 
 
 def box(size_m: Sequence[float]) -> str:
-    """A box with its middle at the origin."""
+    """Return a box centred at the origin."""
     return f'<box size="{_numbers(size_m)}"/>'
 
 
 def cylinder(radius_m: float, length_m: float) -> str:
-    """A cylinder along z with its middle at the origin."""
+    """Return a cylinder along z centred at the origin."""
     return f'<cylinder radius="{float(radius_m)!r}" length="{float(length_m)!r}"/>'
 
 
 def sphere(radius_m: float) -> str:
-    """A ball."""
+    """Return a sphere."""
     return f'<sphere radius="{float(radius_m)!r}"/>'
 
 
 def shape(
     pose: RigidTransform, geometry: str, colour: Colour, *, visual: bool = True, collision: bool = True
 ) -> list[str]:
-    """The same geometry as something to see and something to touch."""
+    """Return the same geometry as visual and collision shape."""
     lines: list[str] = []
     if visual:
         name = "c" + "_".join(f"{c:.3f}" for c in colour)
@@ -70,7 +70,7 @@ def joint(
     axis: Sequence[float] = (0, 0, 1),
     limits: tuple[float, float] = (-9.0, 9.0),
 ) -> list[str]:
-    """A joint tag; limits in rad or m."""
+    """Return a joint tag; limits in rad or m."""
     return [
         f'<joint name="{name}" type="{kind}">',
         f'<parent link="{parent}"/>',
@@ -83,17 +83,17 @@ def joint(
 
 
 def link(name: str, *parts: list[str]) -> list[str]:
-    """A link tag round its parts."""
+    """Return a link tag around its parts."""
     return [f'<link name="{name}">', *[line for part in parts for line in part], "</link>"]
 
 
 def at(x_m: float, y_m: float, z_m: float) -> RigidTransform:
-    """A pure translation."""
+    """Return a pure translation."""
     return RigidTransform.from_translation([x_m, y_m, z_m])
 
 
 def along(start_m: Sequence[float], end_m: Sequence[float]) -> tuple[RigidTransform, float]:
-    """A frame in the middle between two points with z from one to the other, and their distance."""
+    """Return a frame midway between two points with z from the first to the second, and their distance."""
     a, b = np.asarray(start_m, float), np.asarray(end_m, float)
     length = float(np.linalg.norm(b - a))
     if length == 0.0:

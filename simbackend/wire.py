@@ -1,4 +1,4 @@
-"""What crosses the pipe between a cell and its world: one fixed vector of doubles each way per step, no pickle."""
+"""Data format of the pipe between a cell and its world: one fixed vector of doubles each way per step, no pickle."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ DOF = 6
 LIGHTS = 4
 MAX_PROXIMITY = 4
 DOUBLE = 8  # bytes
-PROXIMITY_TICKS = 5  # 100 Hz at the usual tick; fourteen rays would cost a third of every tick
-IMAGE_BYTES = 128 * 2**20  # sparse: only what an image touches costs memory
+PROXIMITY_TICKS = 5  # 100 Hz at the usual tick; fourteen rays per tick would cost a third of its time
+IMAGE_BYTES = 128 * 2**20  # sparse: only pages that an image touches use memory
 
 
 class Op(IntEnum):
-    """What a request asks for."""
+    """Type of a request."""
 
     CLOSE = 0
     STEP = 1
@@ -29,7 +29,10 @@ class Op(IntEnum):
 
 
 class Drive(IntEnum):
-    """What a step says to the arm's drives, a bit each; obeyed in this order. (An `IntFlag` costs 3 us a look.)"""
+    """Commands to the arm's drives in a step, one bit each, obeyed in this order.
+
+    (An `IntFlag` costs 3 us per access.)
+    """
 
     NONE = 0
     STOP = 1
@@ -38,94 +41,94 @@ class Drive(IntEnum):
 
 
 # Request vector of a step: op, ticks, drive, 6 joints, gripper flag, width, force, speed, lights flag, 4 lights.
-REQUEST = 24  # doubles; every request has this length and no frame, so that a step costs one write and one read
+REQUEST = 24  # doubles; all requests have this length without framing, so a step costs one write and one read
 JOINTS_AT, GRIPPER_AT, LIGHTS_AT = 3, 9, 13
 # Request vector of an image: op, width, height, near, fx, fy, cx, cy, kind, then flange_from_camera row by row (3 x 4).
 CAMERA_AT = 9
 
 
 class Picture(IntEnum):
-    """What an image request wants back in shared memory."""
+    """Type of data that an image request returns in shared memory."""
 
-    DEPTH = 0  # float32 metres along the view, NaN where there is nothing
+    DEPTH = 0  # float32 metres along the view, NaN where there is no surface
     GREY = 1  # float32 radiance, one channel
     COLOUR = 3  # float32 radiance, RGB
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """All cheap sensors at one tick; true values, in a vector whose parts are named here."""
+    """All inexpensive sensors at one tick: true values, in a vector whose parts are named here."""
 
     vector: Array
 
     @property
     def tick(self) -> int:
-        """Ticks since the world began."""
+        """Return the ticks since the world began."""
         return int(self.vector[0])
 
     @property
     def stamp_s(self) -> float:
-        """Simulated seconds."""
+        """Return the simulated time in seconds."""
         return float(self.vector[1])
 
     @property
     def is_enabled(self) -> bool:
-        """Drives follow set-points."""
+        """Return whether the drives follow set-points."""
         return bool(self.vector[2])
 
     @property
     def position_rad(self) -> Array:
-        """(6,) joints."""
+        """Return the (6,) joint positions."""
         return self.vector[10:16]
 
     @property
     def velocity_rad_per_s(self) -> Array:
-        """(6,) joint speeds."""
+        """Return the (6,) joint speeds."""
         return self.vector[16:22]
 
     @property
     def setpoint_rad(self) -> Array:
-        """(6,) what the drives aim at."""
+        """Return the (6,) set-points of the drives."""
         return self.vector[22:28]
 
     @property
     def wrench(self) -> Array:
-        """(6,) of the world on the tool in sensor axes, weight inside, N and N m."""
+        """Return the (6,) wrench of the world on the tool in sensor axes, including the weight, N and N m."""
         return self.vector[28:34]
 
     @property
     def pad_force_n(self) -> Array:
-        """(2,) contact force on the left and the right finger."""
+        """Return the (2,) contact forces on the left and the right finger."""
         return self.vector[34:36]
 
     @property
     def width_m(self) -> float:
-        """Opening between the pads."""
+        """Return the opening between the pads."""
         return float(self.vector[36])
 
     @property
     def is_gripper_moving(self) -> bool:
-        """The gripper is on its way."""
+        """Return whether the gripper is moving."""
         return bool(self.vector[37])
 
     @property
     def is_holding(self) -> bool:
-        """The gripper stopped at its force."""
+        """Return whether the gripper has stopped at its set force."""
         return bool(self.vector[38])
 
     @property
     def lights_on(self) -> Array:
-        """(4,) border lights, 1.0 when on."""
+        """Return the (4,) border lights, 1.0 when on."""
         return self.vector[40:44]
 
     @property
     def distance_m(self) -> Array:
-        """(4,) proximity sensors in the order of `WorldConfig.proximity`; NaN when nothing is in range."""
+        """Return (4,) proximity distances in the order of `WorldConfig.proximity`; NaN when nothing is in range."""
         return self.vector[44:48]
 
     @property
     def distance_tick(self) -> int:
-        """The tick that the distances were measured at."""
+        """Return the tick at which the distances were measured."""
         return int(self.vector[48])
 
 
@@ -134,7 +137,7 @@ SNAPSHOT = 49
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WorldConfig:
-    """What a world is built from; sent once."""
+    """Configuration of a world; sent once."""
 
     cell: Cell
     model: str
@@ -145,7 +148,7 @@ class WorldConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Emitter:
-    """Something that shines: colour (RGB, 0 to 1), place in base axes, radius."""
+    """Light source: colour (RGB, 0 to 1), position in base axes, radius."""
 
     colour: tuple[float, float, float]
     position_m: tuple[float, float, float]
@@ -155,7 +158,7 @@ class Emitter:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PictureInfo:
-    """What comes back beside the pixels."""
+    """Description that is returned with the pixels."""
 
     tick: int
     stamp_s: float
@@ -165,10 +168,10 @@ class PictureInfo:
 
 
 def read_exactly(descriptor: int, count: int) -> bytes:
-    """`count` bytes from a stream.
+    """Return `count` bytes from a stream.
 
     Raises:
-        EOFError: the other side has gone.
+        EOFError: the other side has closed it.
     """
     data = os.read(descriptor, count)
     while len(data) < count:

@@ -1,4 +1,4 @@
-"""The PyBullet world of one cell: arm, tool and panel, stepped tick by tick. Runs in a process of its own."""
+"""PyBullet world of one cell: arm, tool and panel, stepped tick by tick. Runs in a process of its own."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from simbackend.wire import (
 )
 
 GRAVITY_M_PER_S2 = 9.81
-TIP_TICKS = 4  # how often to look which mechanisms are near; the tip goes 8 mm meanwhile
-UNUSED_7 = (0.0,) * 7  # numbers that the snapshot keeps free
-FINGER_FORCE_N = 250.0  # of the motors, far above the gripper's: its own model limits what it squeezes with
-ARM_GAIN, FINGER_GAIN = 0.45, 0.6  # share of a joint's error that its motor makes good in one tick
+TIP_TICKS = 4  # how often to check which mechanisms are near; the tip moves up to 8 mm meanwhile
+UNUSED_7 = (0.0,) * 7  # values of the snapshot that are always zero
+FINGER_FORCE_N = 250.0  # of the motors, far above the gripper's: its own model limits the grip force
+ARM_GAIN, FINGER_GAIN = 0.45, 0.6  # fraction of a joint's error that its motor corrects in one tick
 CONE_RAYS = 4
 CONE_RAD = 0.0175
 CONE_DEPTH_M = 0.02
-PAST_TICKS, PAST_KEPT = 100, 4500  # what objects showed, for the judge: at 500 Hz every 0.2 s for 15 minutes
+PAST_TICKS, PAST_KEPT = 100, 4500  # past object states for the judge: at 500 Hz every 0.2 s for 15 minutes
 
 
 class World:
-    """One simulated cell. Deterministic: the same config and the same commands give the same bits."""
+    """One simulated cell. Deterministic: equal configurations and commands give bit-identical results."""
 
     def __init__(self, config: WorldConfig) -> None:
         pybullet = _quiet_pybullet()
@@ -73,7 +73,7 @@ class World:
         )
         self._past: deque[tuple[int, tuple[ObjectTruth, ...]]] = deque(maxlen=PAST_KEPT)
         self.initial = self.panel.truth()
-        self._proximity = np.full(MAX_PROXIMITY + 1, np.nan)  # distances, then the tick they belong to
+        self._proximity = np.full(MAX_PROXIMITY + 1, np.nan)  # distances, then the tick at which they were measured
         self._settle()
         self._measure_distances()
 
@@ -87,7 +87,7 @@ class World:
         )
         path = folder / "arm.urdf"
         path.write_text(urdf, encoding="ascii")
-        # Without the flag the engine makes inertia up from the shapes, and a light bat leaps through its stop.
+        # Without the flag the engine computes inertia from the shapes, and a light bat jumps through its stop.
         self.arm = engine.loadURDF(str(path), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE)
         index = {engine.getJointInfo(self.arm, i)[1].decode(): i for i in range(engine.getNumJoints(self.arm))}
         self.joints = [index[f"link{i + 1}"] for i in range(DOF)]
@@ -140,22 +140,22 @@ class World:
         return 0.9
 
     def _settle(self) -> None:
-        """Let the joints find their rest before time begins."""
+        """Let the joints settle before time begins."""
         self._read_joints()
         for _ in range(20):
             self._advance()
         self.tick = 0
         self.peak_force_n = 0.0
-        # The first picture loads the compiled kernel: better now than in the middle of a motion.
+        # The first picture loads the compiled kernel, which is better done now than during a motion.
         self.scene.draw(self.flange(), width=8, height=8, focal=(8.0, 8.0), centre=(3.5, 3.5), near_m=0.05, channels=1)
 
     def step(self, request: Array) -> Array:
-        """Obey one request and pass its number of ticks; returns the snapshot vector."""
+        """Execute one request and advance by its number of ticks; return the snapshot vector."""
         self._obey(request)
         ticks = int(request[1])
         for i in range(ticks):
             self._advance()
-            # Only the last measurement of a batch will be seen.
+            # Only the last measurement of a batch is visible to the client.
             if self.tick % PROXIMITY_TICKS == 0 and ticks - i <= PROXIMITY_TICKS:
                 self._measure_distances()
         return self.snapshot()
@@ -178,7 +178,7 @@ class World:
         self.drive.tick()
         self.gripper.tick(self.pad_force_n)
         half, pad_speed = self.gripper.width_m / 2, self.gripper.speed / 2
-        # Gravity torque beside the position motor: the servo sags by 2 to 12 mrad without it and by 1e-16 with it.
+        # Gravity torque is added to the position motor: the servo sags by 2 to 12 mrad without it and by 1e-16 with it.
         gravity = engine.calculateInverseDynamics(self.arm, self.q, self._zeros, self._zeros)
         engine.setJointMotorControlArray(self.arm, self.moving, engine.TORQUE_CONTROL, forces=gravity)
         engine.setJointMotorControlArray(
@@ -227,8 +227,8 @@ class World:
         self.peak_force_n = max(self.peak_force_n, float(np.linalg.norm(total)))
 
     def snapshot(self) -> Array:
-        """The vector that `Snapshot` names."""
-        reaction = [-x for x in self.reaction]  # of the sensor on the tool's mount; we want the world on the tool
+        """Return the vector whose parts `Snapshot` names."""
+        reaction = [-x for x in self.reaction]  # the world on the tool, not the sensor
         return np.array(
             [
                 *(self.tick, self.tick * self.dt_s, self.drive.is_enabled, *UNUSED_7),
@@ -244,11 +244,11 @@ class World:
         )
 
     def flange(self) -> RigidTransform:
-        """True base_from_flange."""
+        """Return the true base_from_flange."""
         return base_from_flange(self.model.capabilities.links, np.asarray(self.q[:DOF]))
 
     def _measure_distances(self) -> None:
-        """Nearest surface in a narrow cone along each sensor's z, averaged over the rays that see the nearest thing."""
+        """Measure the nearest surface in a narrow cone along each sensor's z, averaged over the rays that hit it."""
         self._proximity[4] = self.tick
         if not self.config.proximity:
             return
@@ -264,10 +264,10 @@ class World:
             self._proximity[i] = _nearest(depths[i * len(RAYS) : (i + 1) * len(RAYS)])
 
     def truth(self, initial_s: float = 0.0) -> Truth:
-        """What the judge compares with.
+        """Return the true states that the judge compares with.
 
         Args:
-            initial_s: simulated time at which `initial` is wanted, as far back as is kept; 0 is the beginning.
+            initial_s: simulated time of the `initial` states, within the history kept; 0 is the beginning.
         """
         return Truth(
             base_from_panel_matrix=np.asarray(self.panel.base_from_panel.as_matrix()),
@@ -278,17 +278,17 @@ class World:
         )
 
     def _showed(self, time_s: float) -> tuple[ObjectTruth, ...]:
-        """What the objects showed then, or a moment before."""
+        """Return the object states at that time, or shortly before."""
         before = (things for tick, things in reversed(self._past) if tick * self.dt_s <= time_s)
         return next(before, self.initial)
 
     def close(self) -> None:
-        """Let the engine go."""
+        """Disconnect from the engine."""
         self.engine.disconnect()
 
 
 def _quiet_pybullet() -> Any:
-    """PyBullet, without the build time that its import writes past Python to the terminal."""
+    """Import PyBullet, suppressing the build time that the import prints directly to the terminal."""
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -303,7 +303,7 @@ def _quiet_pybullet() -> Any:
 
 
 def _nearest(depths_m: list[float]) -> float:
-    """Mean depth of the rays that see the nearest thing; NaN when none sees anything."""
+    """Return the mean depth of the rays that hit the nearest surface; NaN when none hits anything."""
     first_m = min(depths_m)
     if math.isinf(first_m):
         return math.nan

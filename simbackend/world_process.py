@@ -1,4 +1,4 @@
-"""`python -m simbackend.world_process FD_PIPE FD_IMAGE`: one world, obeying one pipe until it closes."""
+"""`python -m simbackend.world_process FD_PIPE FD_IMAGE`: one world that serves one pipe until it closes."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from simbackend.world import World
 
 
 def serve(pipe: Connection, images: mmap.mmap) -> None:
-    """Build the world that the first message describes, then answer requests until the other side goes."""
+    """Build the world described by the first message, then answer requests until the pipe closes."""
     try:
         config = pipe.recv()
         if config.cell.file.cell.mode == "sim":
             share_core(os.getppid())
         world = World(config)
-    except Exception as error:  # whatever keeps a world from being built must reach the person who asked for it
+    except Exception as error:  # whatever prevents a world from being built must reach the user who started it
         pipe.send(f"{type(error).__name__}: {error}")
         return
     pipe.send(None)
@@ -51,7 +51,7 @@ def serve(pipe: Connection, images: mmap.mmap) -> None:
 
 
 def picture(world: World, request: Array, images: mmap.mmap) -> PictureInfo:
-    """Draw into the shared memory."""
+    """Render into the shared memory."""
     width, height, near_m, fx, fy, cx, cy, kind = (float(x) for x in request[1:CAMERA_AT])
     matrix = np.eye(4)
     matrix[:3] = request[CAMERA_AT : CAMERA_AT + 12].reshape(3, 4)
@@ -84,10 +84,10 @@ def _put(images: mmap.mmap, array: NDArray[np.float32]) -> None:
 
 
 def main() -> None:
-    """Entry of the process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which closes the pipe
+    """Run the world process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which closes the pipe
     pipe_fd, image_fd = int(sys.argv[1]), int(sys.argv[2])
-    gone = contextlib.suppress(BrokenPipeError, ConnectionResetError)  # who asked has died: nobody waits for the answer
+    gone = contextlib.suppress(BrokenPipeError, ConnectionResetError)  # the client has died
     with mmap.mmap(image_fd, IMAGE_BYTES) as images, Connection(pipe_fd) as pipe, gone:
         serve(pipe, images)
 

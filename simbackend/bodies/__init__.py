@@ -1,4 +1,4 @@
-"""Simulated bodies, one file a kind, and what a package needs that brings a further one."""
+"""Simulated bodies, one file per kind, and the interface for packages that add another kind."""
 
 from __future__ import annotations
 

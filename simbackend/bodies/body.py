@@ -1,4 +1,4 @@
-"""What a kind of object needs to be simulated: how it is drawn from the seed, built, moved, printed and judged."""
+"""Base class of simulated object kinds: initial state, model, mechanism, printing on the plate, and true state."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ K = TypeVar("K", bound=PanelObject)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """What an object shows when the world begins.
+    """Initial state of an object.
 
     Attributes:
-        place: joint position (rad clockwise, m along the track), needle angle of an instrument.
-        is_on: lamp lit, button latched.
-        text: what a display shows.
-        value: the value behind `place` or `text`.
+        place: joint position (rad clockwise, or m along the track), or needle angle of an instrument.
+        is_on: whether the lamp is lit or the button latched.
+        text: the text on a display.
+        value: the quantity that `place` or `text` represents.
     """
 
     place: float = 0.0
@@ -35,36 +35,36 @@ class Start:
 
 
 class Body(ABC, Generic[K]):
-    """The simulated body of one kind. It has no state: one instance serves every object of the kind."""
+    """Simulated body of one kind. It holds no state: one instance serves all objects of the kind."""
 
     @abstractmethod
     def start(self, panel_object: K, u: float) -> Start:
-        """What the object shows at first; `u`, drawn evenly from 0 to 1, says which of all its states that is."""
+        """Return the initial state; `u`, uniform from 0 to 1, selects one of all possible states."""
 
     @abstractmethod
     def model(self, panel_object: K, start: Start) -> ObjectModel:
-        """Its links and pictures."""
+        """Return the links and pictures of the object."""
 
     @abstractmethod
     def print_on(self, canvas: Canvas, panel_object: K) -> None:
-        """Print what stands about it on the plate: label, marks, names of places."""
+        """Print the object's surroundings on the plate: label, marks, state names."""
 
     @abstractmethod
     def truth(self, panel_object: K, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """What it really shows now, for the judge of a finished mission; `is_lit` where it has a `shine`."""
+        """Return the true state for the judge of a finished mission; `is_lit` applies to objects with a `shine`."""
 
     def mechanism(self, engine: Any, body: int, panel_object: K, start: Start, effort_ratio: float) -> Mechanism:
-        """What holds its joint; a needle's movement unless the kind says otherwise.
+        """Return the mechanism of its joint; by default that of an instrument's needle.
 
         Args:
             engine: a connected PyBullet client.
-            effort_ratio: friction, spring or detent of the built object over the panel file's.
+            effort_ratio: friction, spring or detent force of the built object relative to the panel file.
         """
         return Friction(engine=engine, body=body, effort=1.0)
 
 
 def body_of(kind: str) -> Body[Any]:
-    """The body of a kind.
+    """Return the body of a kind.
 
     Raises:
         Unsupported: the kind is not simulated.
@@ -74,10 +74,10 @@ def body_of(kind: str) -> Body[Any]:
 
 
 def place_of(mechanism: Mechanism | None) -> float:
-    """Joint position; 0 for what has no joint."""
+    """Return the joint position, or 0 for an object without a joint."""
     return 0.0 if mechanism is None else mechanism.place()
 
 
 def picked(items: Sequence[Any], u: float) -> Any:
-    """The item at the share `u` of a sequence."""
+    """Return the item of a sequence at the fraction `u` of its length."""
     return items[int(u * len(items))]

@@ -1,4 +1,4 @@
-"""A push button: a cap on a spring, which may latch."""
+"""Push button: a cap on a spring, with an optional latch."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from simbackend.urdf import at, cylinder, shape
 
 
 class ButtonBody(Body[Button]):
-    """Out, or held in by its latch."""
+    """Button that is out, or held in by its latch."""
 
     def start(self, panel_object: Button, u: float) -> Start:
-        """One that latches is in, in half of all worlds."""
+        """Return a state; a latching button starts pressed with probability one half."""
         return Start(is_on=panel_object.latching and u < 0.5)
 
     def model(self, panel_object: Button, start: Start) -> ObjectModel:
-        """The cap."""
+        """Return the cap."""
         r, h, travel_m = panel_object.radius_m, panel_object.height_m, panel_object.travel_m
         cap = shape(at(0, 0, h / 2), cylinder(r, h), PAINT[panel_object.colour])
         limits = (-travel_m, 0.0)
@@ -30,23 +30,23 @@ class ButtonBody(Body[Button]):
         )
 
     def mechanism(self, engine: Any, body: int, panel_object: Button, start: Start, effort_ratio: float) -> Spring:
-        """A spring; a second push frees a latched cap."""
+        """Return a spring; a second push releases a latched cap."""
         return spring(engine, body, panel_object, start, effort_ratio, latching=panel_object.latching, releases=True)
 
     def print_on(self, canvas: Canvas, panel_object: Button) -> None:
-        """A dark bezel and the label."""
+        """Print a dark bezel and the label."""
         canvas.disc(panel_object.position_m, panel_object.radius_m + 0.003, RIM)
         canvas.label(panel_object.position_m, panel_object.radius_m + 0.003, panel_object.label)
 
     def truth(self, panel_object: Button, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """Pressed or released; the value is the number of its presses."""
+        """Return pressed or released; the value is the number of presses."""
         return pressed(panel_object.name, mechanism)
 
 
 def spring(
     engine: Any, body: int, cap: Button | Mushroom, start: Start, effort_ratio: float, *, latching: bool, releases: bool
 ) -> Spring:
-    """The spring of a cap, which stands in its latch if it began there."""
+    """Return the spring of a cap, latched if the cap started latched."""
     made = Spring(
         engine=engine,
         body=body,
@@ -63,7 +63,7 @@ def spring(
 
 
 def pressed(name: str, mechanism: Mechanism | None) -> ObjectTruth:
-    """What a cap on a spring shows."""
+    """Return the true state of a cap on a spring."""
     if not isinstance(mechanism, Spring):
         return ObjectTruth(name=name)
     is_pressed = mechanism.is_latched or mechanism.is_in

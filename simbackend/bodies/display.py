@@ -1,4 +1,4 @@
-"""A seven-segment display: a printed face that never changes."""
+"""Seven-segment display: a printed face that never changes."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ SEGMENTS = {
 
 
 class DisplayBody(Body[Display]):
-    """It shows one number for as long as the world lasts."""
+    """Display that shows one number for the whole life of the world."""
 
     def start(self, panel_object: Display, u: float) -> Start:
-        """A number of its range that its digits can show."""
+        """Return a number within its range that its digits can show."""
         low, high = _displayable(panel_object)
         value = round(low + (0.02 + 0.96 * u) * (high - low), panel_object.decimals)
         return Start(text=display_text(panel_object, value), value=value)
 
     def model(self, panel_object: Display, start: Start) -> ObjectModel:
-        """The face."""
+        """Return the face."""
         size_m = (panel_object.width_m, panel_object.height_m)
         face = display_face(panel_object, start.text or "")
         return ObjectModel(quads=(Quad(pixels=face, size_m=size_m, centre_m=(0, 0, FACE_HEIGHT_M)),))
 
     def print_on(self, canvas: Canvas, panel_object: Display) -> None:
-        """The label."""
+        """Print the label."""
         canvas.label(panel_object.position_m, panel_object.height_m / 2, panel_object.label)
 
     def truth(self, panel_object: Display, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """Its characters and their number."""
+        """Return the characters shown and their numeric value."""
         return ObjectTruth(name=panel_object.name, value=start.value, text=start.text)
 
 
 def _displayable(panel_object: Display) -> tuple[float, float]:
-    """The file's range, cut to what its digits can show; a minus sign takes one of them."""
+    """Return the range of the panel file, limited to what the digits can show; a minus sign takes one digit."""
     unit = 10.0**-panel_object.decimals
     highest = (10**panel_object.digits - 1) * unit
     lowest = -(10 ** (panel_object.digits - 1) - 1) * unit
@@ -55,14 +55,14 @@ def _displayable(panel_object: Display) -> tuple[float, float]:
 
 
 def display_text(panel_object: Display, value: float) -> str:
-    """The characters on the display, right-justified; a point does not take a digit's place."""
+    """Return the characters on the display, right-justified; a decimal point takes no digit."""
     text = f"{value:.{panel_object.decimals}f}"
     width = panel_object.digits + (1 if panel_object.decimals else 0)
     return text.rjust(width)
 
 
 def display_face(panel_object: Display, text: str) -> Pixels:
-    """Seven-segment digits, slanted by 6 degrees, in a dark frame."""
+    """Return a picture of seven-segment digits, slanted by 6 degrees, in a dark frame."""
     back, ink = (LED_BACK, LED) if panel_object.style == "led" else (LCD_BACK, LCD)
     canvas = Canvas(panel_object.width_m, panel_object.height_m, FACE_PX_PER_M, RIM)
     canvas.box((0, 0), (panel_object.width_m - 0.004, panel_object.height_m - 0.004), back, round_m=0.001)

@@ -1,4 +1,4 @@
-"""A round instrument: a printed face and a needle over it."""
+"""Round instrument: a printed face and a needle above it."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from simbackend.mechanisms import Mechanism
 
 
 class GaugeBody(Body[Gauge]):
-    """Its needle stands somewhere on the scale and stays there."""
+    """Gauge whose needle stays at one value of the scale."""
 
     def start(self, panel_object: Gauge, u: float) -> Start:
-        """A value away from the ends of the scale."""
+        """Return a value away from the ends of the scale."""
         scale = panel_object.scale
         value = scale.minimum + (0.05 + 0.9 * u) * (scale.maximum - scale.minimum)
         return Start(place=scale.place_of(value), value=value)
 
     def model(self, panel_object: Gauge, start: Start) -> ObjectModel:
-        """Face and needle."""
+        """Return face and needle."""
         r, above_m = panel_object.radius_m, needle_height_m(panel_object.depth_m)
         urdf = needle(length_m=0.76 * r, tail_m=0.22 * r, width_m=0.055 * r, height_m=above_m, pivot_y_m=0.0)
         face = Quad(
@@ -29,16 +29,16 @@ class GaugeBody(Body[Gauge]):
         return ObjectModel(urdf=urdf, quads=(face,), place=start.place)
 
     def print_on(self, canvas: Canvas, panel_object: Gauge) -> None:
-        """The label."""
+        """Print the label."""
         canvas.label(panel_object.position_m, panel_object.radius_m, panel_object.label)
 
     def truth(self, panel_object: Gauge, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """The value under the needle."""
+        """Return the value that the needle shows."""
         return ObjectTruth(name=panel_object.name, value=panel_object.scale.value_at(place_of(mechanism)))
 
 
 def gauge_face(panel_object: Gauge) -> Pixels:
-    """Dark rim, white face, major and minor ticks, numerals, unit."""
+    """Return a picture with dark rim, white face, major and minor ticks, numerals and unit."""
     r, scale = panel_object.radius_m, panel_object.scale
     canvas = Canvas(2 * r, 2 * r, FACE_PX_PER_M, RIM)
     canvas.disc((0, 0), 0.91 * r, FACE)

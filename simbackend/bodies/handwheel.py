@@ -1,4 +1,4 @@
-"""A valve wheel: rim, hub and spokes, one of them marked, which rub round between two stops."""
+"""Handwheel of a valve: rim, hub and spokes, one of them marked, turning with friction between two stops."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ BLUE: Colour = (0.10, 0.25, 0.55)
 
 
 class HandwheelBody(Body[Handwheel]):
-    """It stays where it is turned."""
+    """Handwheel that stays where it is turned."""
 
     def start(self, panel_object: Handwheel, u: float) -> Start:
-        """Within two radians of straight up."""
+        """Return an angle within two radians of upright."""
         low = max(panel_object.minimum_rad, -SPREAD_RAD)
         high = min(panel_object.maximum_rad, SPREAD_RAD)
         return Start(place=low + u * (high - low))
 
     def model(self, panel_object: Handwheel, start: Start) -> ObjectModel:
-        """Hub, a rim of straight pieces, and spokes."""
+        """Return hub, rim of straight pieces, and spokes."""
         h, r, rim_m = panel_object.height_m, panel_object.radius_m, panel_object.rim_m
         ring_m = h - rim_m
         angles = np.linspace(0.0, 2 * np.pi, SEGMENTS + 1)
@@ -44,7 +44,7 @@ class HandwheelBody(Body[Handwheel]):
             angle = 2 * math.pi * i / panel_object.spokes
             end = (r * math.sin(angle), r * math.cos(angle), ring_m)
             middle, length_m = along((0, 0, ring_m), end)
-            # The marked spoke is white and wider than the others: it shows the angle.
+            # The marked spoke is white and wider than the others, so that the angle can be seen.
             colour, radius_m = (WHITE, 0.0036) if i == 0 else (BLUE, 0.003)
             parts.append(shape(middle, cylinder(radius_m, length_m), colour))
         limits = (panel_object.minimum_rad, panel_object.maximum_rad)
@@ -52,16 +52,16 @@ class HandwheelBody(Body[Handwheel]):
         return ObjectModel(urdf=urdf, place=start.place)
 
     def mechanism(self, engine: Any, body: int, panel_object: Handwheel, start: Start, effort_ratio: float) -> Friction:
-        """Friction between its stops."""
+        """Return friction between two stops."""
         effort = panel_object.torque_nm * effort_ratio
         return Friction(engine=engine, body=body, effort=effort, damping=TURN_DAMPING_NM_S_PER_RAD)
 
     def print_on(self, canvas: Canvas, panel_object: Handwheel) -> None:
-        """The label."""
+        """Print the label."""
         canvas.label(panel_object.position_m, panel_object.radius_m + panel_object.rim_m, panel_object.label)
 
     def truth(self, panel_object: Handwheel, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """The angle of the marked spoke."""
+        """Return the angle of the marked spoke."""
         return ObjectTruth(name=panel_object.name, value=place_of(mechanism))
 
 

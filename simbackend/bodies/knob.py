@@ -1,4 +1,4 @@
-"""A knob: it rubs round its axis between the ends of its scale and stays where it is turned."""
+"""Knob: turns about its axis with friction between the ends of its scale and stays where it is turned."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from simbackend.mechanisms import TURN_DAMPING_NM_S_PER_RAD, Friction, Mechanism
 
 
 class KnobBody(Body[Knob]):
-    """It stays where it is turned."""
+    """Knob that stays where it is turned."""
 
     def start(self, panel_object: Knob, u: float) -> Start:
-        """A value away from the ends of the scale."""
+        """Return a value away from the ends of the scale."""
         scale = panel_object.scale
         value = scale.minimum + (0.1 + 0.8 * u) * scale.span
         return Start(place=scale.place_of(value), value=value)
 
     def model(self, panel_object: Knob, start: Start) -> ObjectModel:
-        """Knob, bar and mark."""
+        """Return knob, bar and mark."""
         low, high = sorted((panel_object.scale.at_min, panel_object.scale.at_max))
         parts = knob_with_bar(panel_object.radius_m, panel_object.height_m)
         limits = (low - 0.05, high + 0.05)
@@ -31,18 +31,18 @@ class KnobBody(Body[Knob]):
         return ObjectModel(urdf=urdf, place=start.place)
 
     def mechanism(self, engine: Any, body: int, panel_object: Knob, start: Start, effort_ratio: float) -> Friction:
-        """Friction between its stops."""
+        """Return friction between two stops."""
         effort = panel_object.torque_nm * effort_ratio
         return Friction(engine=engine, body=body, effort=effort, damping=TURN_DAMPING_NM_S_PER_RAD)
 
     def print_on(self, canvas: Canvas, panel_object: Knob) -> None:
-        """Ticks and numerals about it, and the label."""
+        """Print ticks and numerals around the knob, and the label."""
         r = panel_object.radius_m
         canvas.scale(panel_object.position_m, panel_object.scale, outer_m=r + 0.006, text_m=r + 0.011, tall_m=0.0038)
         canvas.label(panel_object.position_m, r + 0.008, panel_object.label)
 
     def truth(self, panel_object: Knob, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """The value that its mark points at."""
+        """Return the value that its mark points at."""
         return ObjectTruth(name=panel_object.name, value=panel_object.scale.value_at(place_of(mechanism)))
 
 

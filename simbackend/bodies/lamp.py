@@ -1,4 +1,4 @@
-"""An indicator lamp: a lens that lights up."""
+"""Indicator lamp: a lens that lights up."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from simbackend.mechanisms import Mechanism
 
 
 class LampBody(Body[Lamp]):
-    """Lit or not; a button may work it."""
+    """Lamp that is lit or not; a button may switch it."""
 
     def start(self, panel_object: Lamp, u: float) -> Start:
-        """Lit in half of all worlds."""
+        """Return a state that is lit with probability one half."""
         return Start(is_on=u < 0.5)
 
     def model(self, panel_object: Lamp, start: Start) -> ObjectModel:
-        """One round block."""
+        """Return one round block."""
         colour, radius_m, height_m = panel_object.colour, panel_object.radius_m, panel_object.height_m
         return ObjectModel(
             urdf=disc(radius_m, max(height_m, LENS_M), PAINT[colour]),
@@ -26,12 +26,12 @@ class LampBody(Body[Lamp]):
         )
 
     def print_on(self, canvas: Canvas, panel_object: Lamp) -> None:
-        """A dark bezel and the label."""
+        """Print a dark bezel and the label."""
         canvas.disc(panel_object.position_m, panel_object.radius_m + 0.0025, RIM)
         canvas.label(panel_object.position_m, panel_object.radius_m + 0.0025, panel_object.label)
 
     def truth(self, panel_object: Lamp, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """On or off."""
+        """Return on or off."""
         return ObjectTruth(name=panel_object.name, state="on" if is_lit else "off")
 
 

@@ -1,4 +1,4 @@
-"""An emergency mushroom: a wide head on a spring, which latches and stays."""
+"""Emergency stop mushroom: a wide head on a spring, which latches when pressed."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from simbackend.urdf import at, cylinder, shape
 
 
 class MushroomBody(Body[Mushroom]):
-    """Released at first."""
+    """Emergency stop that starts released."""
 
     def start(self, panel_object: Mushroom, u: float) -> Start:
-        """Released."""
+        """Return the released state."""
         return Start()
 
     def model(self, panel_object: Mushroom, start: Start) -> ObjectModel:
-        """Head and stem."""
+        """Return head and stem."""
         r, h = panel_object.radius_m, panel_object.height_m
         head_m = 0.5 * h
         parts = [
@@ -35,16 +35,16 @@ class MushroomBody(Body[Mushroom]):
         )
 
     def mechanism(self, engine: Any, body: int, panel_object: Mushroom, start: Start, effort_ratio: float) -> Spring:
-        """A spring with a latch that no push frees."""
+        """Return a spring with a latch that no push releases."""
         return spring(engine, body, panel_object, start, effort_ratio, latching=True, releases=False)
 
     def print_on(self, canvas: Canvas, panel_object: Mushroom) -> None:
-        """A yellow ground and the label."""
+        """Print a yellow background and the label."""
         canvas.disc(panel_object.position_m, panel_object.radius_m + 0.010, YELLOW)
         canvas.label(panel_object.position_m, panel_object.radius_m + 0.010, panel_object.label)
 
     def truth(self, panel_object: Mushroom, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """Pressed or released; the value is the number of its presses."""
+        """Return pressed or released; the value is the number of presses."""
         return pressed(panel_object.name, mechanism)
 
 

@@ -1,4 +1,4 @@
-"""A moving-coil meter: a framed face and a needle over it."""
+"""Moving-coil meter: a framed face and a needle above it."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from simbackend.mechanisms import Mechanism
 
 
 class PanelMeterBody(Body[PanelMeter]):
-    """Its needle stands somewhere on the scale and stays there."""
+    """Meter whose needle stays at one value of the scale."""
 
     def start(self, panel_object: PanelMeter, u: float) -> Start:
-        """A value away from the ends of the scale."""
+        """Return a value away from the ends of the scale."""
         scale = panel_object.scale
         value = scale.minimum + (0.05 + 0.9 * u) * (scale.maximum - scale.minimum)
         return Start(place=scale.place_of(value), value=value)
 
     def model(self, panel_object: PanelMeter, start: Start) -> ObjectModel:
-        """Face and needle."""
+        """Return face and needle."""
         urdf = needle(
             length_m=panel_object.needle_m,
             tail_m=0.12 * panel_object.needle_m,
@@ -33,18 +33,18 @@ class PanelMeterBody(Body[PanelMeter]):
         return ObjectModel(urdf=urdf, quads=(face,), place=start.place)
 
     def print_on(self, canvas: Canvas, panel_object: PanelMeter) -> None:
-        """The label."""
+        """Print the label."""
         canvas.label(panel_object.position_m, panel_object.height_m / 2, panel_object.label)
 
     def truth(
         self, panel_object: PanelMeter, start: Start, mechanism: Mechanism | None, *, is_lit: bool
     ) -> ObjectTruth:
-        """The value under the needle."""
+        """Return the value that the needle shows."""
         return ObjectTruth(name=panel_object.name, value=panel_object.scale.value_at(place_of(mechanism)))
 
 
 def meter_face(panel_object: PanelMeter) -> Pixels:
-    """Dark frame, white face, an arc of ticks about the pivot."""
+    """Return a picture with dark frame, white face, and an arc of ticks around the pivot."""
     canvas = Canvas(panel_object.width_m, panel_object.height_m, FACE_PX_PER_M, RIM)
     canvas.box((0, 0), (panel_object.width_m - 0.006, panel_object.height_m - 0.006), FACE, round_m=0.002)
     pivot = (0.0, -panel_object.pivot_below_m)

@@ -1,7 +1,7 @@
-"""What simulated bodies are made of: links of a URDF, printed pictures, what shines, and how joints count.
+"""Building blocks of simulated bodies: URDF links, printed pictures, shining parts.
 
-Everything is in panel axes about the object's middle on the plate (z out of the plate). Joints count clockwise turns,
-metres along the track, or metres out of the plate as positive. Heights: instrument faces lie 1 mm above the plate.
+All coordinates are in panel axes from the object's centre on the plate (z out of the plate). Joint positions are
+positive clockwise, along the track, or out of the plate. Instrument faces lie 1 mm above the plate.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PAINT: dict[str, Colour] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Quad:
-    """A flat picture: `round` ones are discs. Centre and size in the object's axes, metres."""
+    """Flat picture; `round` ones are discs. Centre and size in the object's axes, metres."""
 
     pixels: NDArray[np.uint8]
     size_m: tuple[float, float]
@@ -44,7 +44,7 @@ class Quad:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shine:
-    """A lens that lights up: its colour by name (see `PAINT`), radius and height of its front, m."""
+    """Lens that lights up: its colour by name (see `PAINT`), radius and height of its front, m."""
 
     colour: str
     radius_m: float
@@ -53,13 +53,13 @@ class Shine:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObjectModel:
-    """What the world loads for one object.
+    """Model of one object, as loaded by the world.
 
     Attributes:
         urdf: lines with the base link `base` and at most one moving joint; none for a body that is only printed.
         quads: printed pictures.
-        place: where the joint stands at first.
-        shine: how its base lights up, for an object that can.
+        place: initial position of the joint.
+        shine: how the base lights up, for an object that can.
     """
 
     urdf: list[str] = field(default_factory=list)
@@ -69,9 +69,9 @@ class ObjectModel:
 
 
 def light_urdf(light: Light) -> str:
-    """A border light: a dark holder (base) with a thin lens (link 0) whose face is at the light's place.
+    """Return a border light: a dark holder (base) with a thin lens (link 0) whose face is at the light's position.
 
-    Were the whole body to shine, its flank would move the middle of the spot by half a pixel in a slanting view.
+    If the whole body shone, its side would shift the centre of the spot by half a pixel in an oblique view.
     """
     low_m = max(light.position_m[2] - LENS_M, 1e-4)
     lines = base(shape(at(0, 0, low_m / 2), cylinder(light.radius_m, low_m), INK))
@@ -84,17 +84,17 @@ def light_urdf(light: Light) -> str:
 
 
 def robot(lines: list[str]) -> str:
-    """The whole URDF text."""
+    """Return the complete URDF text."""
     return "\n".join(['<robot name="part">', *lines, "</robot>"])
 
 
 def base(*parts: list[str]) -> list[str]:
-    """The link that stands on the plate."""
+    """Return the link that is fixed to the plate."""
     return link("base", inertial(0.0, (0, 0, 0), (0.0, 0.0, 0.0)), *parts)
 
 
 def disc(radius_m: float, height_m: float, colour: Colour) -> list[str]:
-    """A base that is one round block."""
+    """Return a base that is one round block."""
     return base(shape(at(0, 0, height_m / 2), cylinder(radius_m, height_m), colour))
 
 
@@ -109,14 +109,14 @@ def moving(
     pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     fixed: list[list[str]] | None = None,
 ) -> list[str]:
-    """A part on a joint: `kind` is `revolute` or `prismatic`, `limits` are its end stops (rad or m)."""
+    """Return a part on a joint: `kind` is `revolute` or `prismatic`, `limits` are its end stops (rad or m)."""
     lines = base(*(fixed or []))
     lines += link("part", inertial(mass_kg, (0, 0, 0), (inertia_kg_m2,) * 3), *parts)
     return lines + joint("part", kind, "base", "part", at(*pivot_m), axis=axis, limits=limits)
 
 
 def needle(*, length_m: float, tail_m: float, width_m: float, height_m: float, pivot_y_m: float) -> list[str]:
-    """An instrument's needle that turns about a pivot above or below the object's middle."""
+    """Return the needle of an instrument, which turns about a pivot above or below the object's centre."""
     middle_m = (length_m - tail_m) / 2
     parts = [
         shape(at(0, middle_m, 0), box((width_m, length_m + tail_m, 0.0006)), INK, collision=False),
@@ -134,11 +134,11 @@ def needle(*, length_m: float, tail_m: float, width_m: float, height_m: float, p
 
 
 def needle_height_m(depth_m: float) -> float:
-    """A needle hovers over its face even where the file says that it lies in it."""
+    """Return the needle's height: above its face even if the panel file puts it in the face."""
     return max(depth_m, FACE_HEIGHT_M + 0.001)
 
 
 def nearest_state(states: tuple[State, ...], angle_rad: float) -> str | None:
-    """The state whose place is nearest, None when even that is far."""
+    """Return the state with the nearest place, or None if even that is too far."""
     state = min(states, key=lambda s: abs(s.angle_rad - angle_rad))
     return state.name if abs(state.angle_rad - angle_rad) <= STATE_SLACK_RAD else None

@@ -1,4 +1,4 @@
-"""A slider: a cap that rubs along a straight track."""
+"""Slider: a cap that moves along a straight track with friction."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ LIFT_M = 0.0005
 
 
 class SliderBody(Body[Slider]):
-    """Its cap stays where it is pushed."""
+    """Slider whose cap stays where it is pushed."""
 
     def start(self, panel_object: Slider, u: float) -> Start:
-        """A value away from the ends of the scale."""
+        """Return a value away from the ends of the scale."""
         scale = panel_object.scale
         value = scale.minimum + (0.1 + 0.8 * u) * (scale.maximum - scale.minimum)
         return Start(place=scale.place_of(value), value=value)
 
     def model(self, panel_object: Slider, start: Start) -> ObjectModel:
-        """The cap, with a white line across it."""
+        """Return the cap, with a white line across it."""
         sx, sy, sz = panel_object.cap_size_m
         angle_rad, travel_m = panel_object.angle_rad, panel_object.travel_m
         turn = RigidTransform.from_rotation(Rotation.from_euler("z", angle_rad))
@@ -43,12 +43,12 @@ class SliderBody(Body[Slider]):
         return ObjectModel(urdf=urdf, place=start.place)
 
     def mechanism(self, engine: Any, body: int, panel_object: Slider, start: Start, effort_ratio: float) -> Friction:
-        """Friction between the ends of its track."""
+        """Return friction between the ends of the track."""
         effort = panel_object.friction_n * effort_ratio
         return Friction(engine=engine, body=body, effort=effort, damping=SLIDE_DAMPING_N_S_PER_M)
 
     def print_on(self, canvas: Canvas, panel_object: Slider) -> None:
-        """Slot, ticks and numerals."""
+        """Print slot, ticks and numerals."""
         c, s = math.cos(panel_object.angle_rad), math.sin(panel_object.angle_rad)
 
         def point(along_m: float, across_m: float) -> tuple[float, float]:
@@ -67,7 +67,7 @@ class SliderBody(Body[Slider]):
         canvas.text(point(0.0, -edge_m - 0.009), f"{panel_object.label} {scale.unit}".strip(), 0.0052)
 
     def truth(self, panel_object: Slider, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """The value at the cap's middle."""
+        """Return the value at the centre of the cap."""
         return ObjectTruth(name=panel_object.name, value=panel_object.scale.value_at(place_of(mechanism)))
 
 

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, GetJsonSchemaHandler, TypeAdapter, ValidationError, ValidationInfo, model_validator
 from pydantic_core import CoreSchema, core_schema
 
-from hal import kinds
 from hal.errors import InvalidRequest
+from hal.panel import kinds
 from hal.panel.angles import UNITLESS, Location, again, fault, in_radians
 from hal.panel.base import PanelObject
 from hal.panel.parts import Light, Name, NotNegative, Positive

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from hal.kinds import SKILLS, part_of
 from hal.panel import PanelObject
+from hal.panel.kinds import SKILLS, part_of
 from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import ObjectState, SkillReport, Verify
 

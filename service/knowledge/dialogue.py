@@ -12,8 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from hal.errors import CellError, InvalidRequest
-from hal.kinds import installed_kinds
 from hal.panel import Question
+from hal.panel.kinds import installed_kinds
 from perception.vision.teaching import (
     Example,
     Overview,

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from hal.kinds import BODIES, part_of
 from hal.panel import PanelObject
+from hal.panel.kinds import BODIES, part_of
 from hal.simulated import ObjectTruth
 from simbackend.bodies.parts import ObjectModel
 from simbackend.canvas import Canvas

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PROBE = """
 import json
-from hal.kinds import BODIES, READERS, SKILLS, installed_kinds, part_of
+from hal.panel.kinds import BODIES, READERS, SKILLS, installed_kinds, part_of
 from hal.panel import Panel
 from hal.strict import parse_toml
 lights = "".join(

@@ -10,8 +10,8 @@ import pytest
 
 from hal.config import load_cell
 from hal.errors import ConfigError
-from hal.kinds import installed_kinds
 from hal.panel import Gauge, Lever, load_panel
+from hal.panel.kinds import installed_kinds
 from tests.simbackend.rig import ROOT, SimCell, sim_cell
 
 PANEL = load_panel(ROOT / "panels" / "bench.toml")

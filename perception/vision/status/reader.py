@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from hal.arrays import Array, Image
-from hal.kinds import READERS, part_of
 from hal.panel import PanelObject
+from hal.panel.kinds import READERS, part_of
 from perception.vision.patch import Patch, rectify
 from perception.vision.projection import PanelProjection
 from perception.vision.reading import PatchReading, as_often_right

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from hal.errors import InvalidRequest
-from hal.kinds import installed_kinds, kind_model
 from hal.panel import Question
+from hal.panel.kinds import installed_kinds, kind_model
 from perception.vision.knowledge import NOTHING, Knowledge
 
 NAME = Question(key="name", text="What is it called (a short name: small letters, digits, underscores)?")

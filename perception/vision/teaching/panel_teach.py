@@ -14,8 +14,8 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.kinds import kind_model
 from hal.panel import Panel, Question
+from hal.panel.kinds import kind_model
 from hal.strict import validate
 from hal.toml_text import toml_text
 from perception.vision.teaching.panel_lights import LightsFound

@@ -14,7 +14,7 @@ from hal.entry_points import load, near_or_all, registered
 from hal.errors import ConfigError, Unsupported
 
 if TYPE_CHECKING:
-    from hal.panel import PanelObject
+    from hal.panel.base import PanelObject
 
 KINDS = "panelwright.kinds"
 READERS = "panelwright.readers"

@@ -1,6 +1,6 @@
 """Taught knowledge about kinds of objects (files: `knowledge_files`).
 
-A kind has a size and looks. A look is the feature vector of one taught example (see `features`): four rows of numbers
+A kind has a size and looks. A look is the feature vector of one taught example (see `look`): four rows of numbers
 over the distance from the middle, and two tables with such a row per direction. The kind `nothing` holds looks of what
 is *not* an object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array
-from perception.vision.finding.features import NOISY_WEIGHTS, WEIGHTS
+from perception.vision.look import NOISY_WEIGHTS, WEIGHTS
 
 NOTHING = "nothing"
 

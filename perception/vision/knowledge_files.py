@@ -18,8 +18,8 @@ from hal.atomic_write import write_atomically
 from hal.errors import ConfigError
 from hal.strict import Strict, load_toml
 from hal.toml_text import toml_text
-from perception.vision.finding.features import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.knowledge import Knowledge, TaughtKind, spread_of
+from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 
 SHIPPED = Path(__file__).parent / "knowledge"
 OTHER_FILES = frozenset({"proportions"})  # of a knowledge folder: no kinds
@@ -53,7 +53,7 @@ class LookRecord(Strict):
 
     @property
     def look(self) -> Array:
-        """(LENGTH,) in the order of `features`."""
+        """(LENGTH,) in the order of `look`."""
         around = [
             np.asarray(given, float).ravel() if given is not None else np.tile(_ring_means(row), DIRECTIONS)
             for given, row in ((self.gray_around, self.gray), (self.edge_around, self.edge))

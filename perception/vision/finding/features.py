@@ -18,41 +18,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array, Image
 from perception.vision.finding.shapes import Edges
+from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.patch import sample_at
 
 PLATE_PX_PER_M = 1500.0  # resolution of the rectified plate
-RADII_M = np.arange(0.0015, 0.045, 0.003)
 ANGLES = (np.arange(32) + 0.5) * 2 * np.pi / 32
 AROUND_PX = (
     np.stack([np.outer(RADII_M, np.sin(ANGLES)), -np.outer(RADII_M, np.cos(ANGLES))]).reshape(2, -1) * PLATE_PX_PER_M
 )
 RANKS = (5, 16, 27)  # of 32: 15, 50 and 85 %
 AT_ONCE = 64  # places: what lies between stays in the cache, and in memory that the process already has
-GROUPS = ("gray", "uneven", "edge", "strong_edge")
-DIRECTIONS = 8  # clockwise from straight up
-RINGS = len(RADII_M) // 2  # two radii each; the outermost is left to neighbours
 EACH = len(ANGLES) // DIRECTIONS
 # (angles, DIRECTIONS) mean over two radii and the angles about a direction
 TOWARDS = np.roll(np.kron(np.eye(DIRECTIONS), np.full((EACH, 1), 0.5 / EACH)), -(EACH // 2), axis=0).astype(np.float32)
-AROUND_GROUPS = ("gray_around", "edge_around")
-LENGTH = len(GROUPS) * len(RADII_M) + len(AROUND_GROUPS) * DIRECTIONS * RINGS
-# What is the same whichever way a thing is turned counts as much as what lies in which direction: twice a number.
-WEIGHTS = np.repeat([2.0, 1.0], [len(GROUPS) * len(RADII_M), len(AROUND_GROUPS) * DIRECTIONS * RINGS])
-# Of a noisy image edges count more than gray, which its light changes (1.5 to 3 times as much does nearly as well on overviews
-# that were not taught on), and what lies further out nothing: glare, shadow and cables make as much of it as the neighbours.
-NOISY_REACH_M = 0.036
-NOISY_WEIGHTS = (
-    np.repeat(
-        [2.0, 2.0, 4.0, 4.0, 1.0, 1.5],  # of `GROUPS` and `AROUND_GROUPS`
-        [*[len(RADII_M)] * len(GROUPS), *[DIRECTIONS * RINGS] * len(AROUND_GROUPS)],
-    )
-    * np.concatenate(
-        [
-            np.tile(RADII_M < NOISY_REACH_M, len(GROUPS)),
-            np.tile(RADII_M[: 2 * RINGS : 2] < NOISY_REACH_M, len(AROUND_GROUPS) * DIRECTIONS),
-        ]
-    )
-)
 EDGE_GAIN = 40.0
 DESCRIPTORS = 12
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array
-from perception.vision.finding.features import WEIGHTS
 from perception.vision.finding.match import CLIP, distances
 from perception.vision.knowledge import NOTHING, Knowledge
+from perception.vision.look import WEIGHTS
 
 OBJECT_MARGIN, NOTHING_MARGIN = 0.2, 0.03  # by which a look must be nearer to its own kind than to others
 PASSES = 3

@@ -66,7 +66,7 @@ class Example:
         outline: what was found about it on the rectified plate; None only for `nothing`.
         outline_px: (N, 2) the same in the image; (0, 2) where there is none.
         size_m: width and height of the outline on the plate.
-        look: (LENGTH,) see `features`.
+        look: (LENGTH,) see `perception.vision.look`.
         noisy: whether the image is.
     """
 

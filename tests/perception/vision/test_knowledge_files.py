@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from hal.errors import ConfigError
 from hal.strict import parse_toml
-from perception.vision.finding.features import LENGTH
 from perception.vision.knowledge import TaughtKind
 from perception.vision.knowledge_files import (
     SHIPPED,
@@ -24,6 +23,7 @@ from perception.vision.knowledge_files import (
     write_generated_kind,
     write_kind,
 )
+from perception.vision.look import LENGTH
 
 
 def kind(count: int = 4, seed: int = 0) -> TaughtKind:

@@ -12,25 +12,13 @@ import pytest
 from benchmarks.vision_drawing import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.vision.finding.blind import chosen, lay_out, recognise, uprightness
-from perception.vision.finding.features import (
-    AROUND_GROUPS,
-    DIRECTIONS,
-    GROUPS,
-    LENGTH,
-    PLATE_PX_PER_M,
-    RADII_M,
-    RINGS,
-    Ground,
-    half_turned,
-    look_at,
-    plate_gray,
-    region_shape,
-)
+from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray, region_shape
 from perception.vision.finding.match import distances, distances_reference, nearest, prepared
 from perception.vision.finding.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.finding.shapes import find_edges
 from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, spread_of
 from perception.vision.knowledge_files import load_knowledge, write_kind
+from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.projection import CameraProjection, PlateProjection
 from perception.vision.teaching.teach import check, example_at, overview_of, plate_points, teach, teach_example
 from tests.perception.vision.bench_panel import panel, scene

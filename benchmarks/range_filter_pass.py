@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.jit import REORDERED, compiled
-from perception.range import RangeSensorModel
+from perception.range.sensor import RangeSensorModel
 
 Single = NDArray[np.float32]
 

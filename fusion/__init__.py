@@ -62,4 +62,5 @@ __all__ = [
     "unit",
     "warm_up",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -6,7 +6,8 @@ A package lists its names once as imports that only type checkers run, and once 
         from fusion.robust import FusedPose, fuse
 
     __all__ = ["FusedPose", "fuse"]
-    __getattr__ = load_on_first_use(__name__, __file__)
+    if not TYPE_CHECKING:  # else type checkers would take every name from the package
+        __getattr__ = load_on_first_use(__name__, __file__)
 
 Importing such a package costs a fraction of a millisecond, whatever its names bring along.
 """

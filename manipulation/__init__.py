@@ -51,4 +51,5 @@ __all__ = [
     "visiting_order",
     "warm_up",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

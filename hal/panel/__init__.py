@@ -4,7 +4,7 @@ Panel frame: origin in the middle of the plate's front face, x right and y up as
 towards the viewer. Angles of needles, levers and knobs are clockwise from straight up as the viewer sees them (so a
 positive angle is a negative turn about z).
 
-One file a kind of object. Kinds are found by name through the entry-point group `panelwright.kinds` (see `hal.kinds`),
+One file a kind of object. Kinds are found by name through the entry-point group `panelwright.kinds` (see `kinds`),
 so that a package can bring further ones.
 """
 
@@ -85,4 +85,5 @@ __all__ = [
     "circle",
     "load_panel",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -15,4 +15,5 @@ if TYPE_CHECKING:
     from manipulation.plausibility.repetition import Frame, repeated_frame
 
 __all__ = ["Finding", "Frame", "ProximityMonitor", "Symptom", "repeated_frame"]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -17,4 +17,5 @@ if TYPE_CHECKING:
     from manipulation.skills.toggle import throw
 
 __all__ = ["Attempt", "ObjectState", "SkillContext", "SkillReport", "Verify", "perform", "throw"]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -46,4 +46,5 @@ __all__ = [
     "renewed",
     "to_toml",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -10,16 +10,14 @@ if TYPE_CHECKING:
     from perception.range.analysis import RangeScene, analyse
     from perception.range.batch import batch_range, recordings_in
     from perception.range.batch_results import BatchResult, KeptResults
-    from perception.range.features import FeatureKind, RangeFeature
     from perception.range.matching.match import Match, match_models
     from perception.range.matching.models import load_models, shipped_models
     from perception.range.matching.panel_objects import PanelView, Sighting, find_objects
-    from perception.range.noise import NoiseModel, estimate_noise
     from perception.range.plane import PlaneFit, fit_plane_near
     from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface, SurfaceType
     from perception.range.recordings import Reading, assumptions, load_recording
     from perception.range.render import MARK, match_json, picture, scene_json, write_ply, write_png
-    from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
+    from perception.range.sensor import OrthographicSensor, PinholeSensor
     from perception.range.sweep import image_from_sweep
     from perception.range.warm import warm_up
 
@@ -29,18 +27,14 @@ __all__ = [
     "Cone",
     "Cylinder",
     "Ellipsoid",
-    "FeatureKind",
     "KeptResults",
     "Match",
-    "NoiseModel",
     "OrthographicSensor",
     "PanelView",
     "PinholeSensor",
     "Plane",
     "PlaneFit",
-    "RangeFeature",
     "RangeScene",
-    "RangeSensorModel",
     "Reading",
     "Sighting",
     "Sphere",
@@ -49,7 +43,6 @@ __all__ = [
     "analyse",
     "assumptions",
     "batch_range",
-    "estimate_noise",
     "find_objects",
     "fit_plane_near",
     "image_from_sweep",
@@ -65,4 +58,5 @@ __all__ = [
     "write_ply",
     "write_png",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -61,4 +61,5 @@ __all__ = [
     "warm_up",
     "write_kind",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

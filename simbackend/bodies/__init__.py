@@ -37,4 +37,5 @@ __all__ = [
     "shape",
     "sphere",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from house import attic
     from house.cellar import LAMP as LIGHT
 __all__ = ["LIGHT", "attic"]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)
 """
 ROOT = Path(__file__).parents[2]
 

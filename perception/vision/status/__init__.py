@@ -16,4 +16,5 @@ if TYPE_CHECKING:
     from perception.vision.status.reader import Reader
 
 __all__ = ["Patch", "PatchReading", "Reader", "choose", "contrast_noise"]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

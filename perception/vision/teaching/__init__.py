@@ -39,4 +39,5 @@ __all__ = [
     "teach_example",
     "teach_from_panel",
 ]
-__getattr__ = load_on_first_use(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__ = load_on_first_use(__name__, __file__)

@@ -13,10 +13,10 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.errors import ConfigError, InvalidRequest, NotFound
-from perception.range import FeatureKind, SurfaceType, analyse
+from perception.range import SurfaceType, analyse
 from perception.range.batch import analyse_files, batch_range, recordings_in, tasks_of
 from perception.range.batch_results import write_results
-from perception.range.features import corner_point, crease_line
+from perception.range.features import FeatureKind, corner_point, crease_line
 from perception.range.from_points import image_from_points
 from perception.range.recordings import Reading, assumptions, load_recording
 from perception.range.render import MARK, picture, scene_json, write_ply, write_png

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from hal.config import Cell
 from hal.entry_points import registered
 from hal.errors import InvalidRequest, PerceptionError, Unreachable
-from hal.kinds import SKILLS, has_part
 from hal.panel import PanelObject
+from hal.panel.kinds import SKILLS, has_part
 from manipulation import ObjectState, SkillReport, Verify, operate
 from perception.vision import ObjectReading, said
 from service.operations.inspect import ensure_located, look_close, look_past

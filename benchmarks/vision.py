@@ -21,7 +21,8 @@ import numpy as np
 
 from hal.arrays import Image
 from hal.errors import CellError
-from hal.panel import Lever, Panel, PanelObject
+from hal.panel import Lever, Light, Panel, PanelObject
+from hal.panel.kinds import kind_model
 from hal.strict import validate
 from perception.vision.finding.blind import recognise
 from perception.vision.image import as_gray, decode
@@ -51,13 +52,17 @@ def panel_of_job(job: Job) -> Panel:
         {"name": f"light_{k}", "position_m": [sx * reach * width, sy * reach * height, 0.0]}
         for k, (sx, sy) in enumerate(((-1, 1), (1, 1), (1, -1), (-1, -1)))
     ]
-    objects = [_object(entry, job["panel_mm"]) for entry in job["layout"]]
-    panel = validate(
-        {"schema": 1, "name": "job", "width_m": width, "height_m": height, "lights": light, "objects": objects},
-        Panel,
-        source=str(job["id"]),
+    tables = [_object(entry, job["panel_mm"]) for entry in job["layout"]]
+    source = str(job["id"])
+    objects = (validate(table, kind_model(table["kind"]), source=source) for table in tables)
+    # Not validated as a whole: a drawing is read as it is, also where its objects overlap or cover a nominal light.
+    return Panel.model_construct(
+        name="job",
+        width_m=width,
+        height_m=height,
+        lights=tuple(validate(one, Light, source=source) for one in light),
+        objects=tuple(_by_meaning(panel_object) for panel_object in objects),
     )
-    return panel.model_copy(update={"objects": tuple(_by_meaning(panel_object) for panel_object in panel.objects)})
 
 
 def _by_meaning(panel_object: PanelObject) -> PanelObject:

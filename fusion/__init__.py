@@ -24,10 +24,10 @@ if TYPE_CHECKING:
         ProximityObservation,
         TouchObservation,
     )
-    from fusion.planning import PoseTolerance, SensingChoice, TouchPlan, next_measurement
+    from fusion.planning import PoseTolerance, SensingChoice, TouchPlan
     from fusion.robust import FusedPose, ShapeEstimate, fuse
     from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
-    from fusion.shared_errors import ErrorBudget, FusedObservations, error_budget, fuse_observations
+    from fusion.shared_errors import FusedObservations, error_budget, fuse_observations
     from fusion.solve import solve_from_many
     from fusion.warm import warm_up
 
@@ -35,7 +35,6 @@ __all__ = [
     "Box",
     "Contradiction",
     "Cylinder",
-    "ErrorBudget",
     "Feature",
     "FeatureSet",
     "FusedObservations",
@@ -57,7 +56,6 @@ __all__ = [
     "error_budget",
     "fuse",
     "fuse_observations",
-    "next_measurement",
     "solve_from_many",
     "unit",
     "warm_up",

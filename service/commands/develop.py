@@ -39,9 +39,13 @@ def conform(
     seed: SeedOption = None,
 ) -> None:
     """Try the promises of every device kind on the devices of a cell, and write a report (Markdown and JSON)."""
+    from hal.config import load_cell
     from service.commissioning.conform import run
+    from service.commissioning.preflight import check_wires
+    from service.terminal import find_cell
 
-    loaded = read_cell(cell, seed)
+    loaded = load_cell(find_cell(cell), seed=seed)  # not checked as a whole: a cell that is being built may have no arm
+    check_wires(loaded)
     for name in device or ():
         if name not in loaded.file.devices:
             raise ConfigError(

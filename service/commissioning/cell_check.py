@@ -57,7 +57,7 @@ def device_faults(cell: Cell) -> list[Fault]:
     """Return faults for a missing arm, unknown or wrong drivers, options that a driver refuses, and missing mounts."""
     faults = []
     if not cell.names_of(DeviceKind.ARM):
-        hint = 'add [devices.arm] with kind = "arm" and its driver; `panelwright drivers` lists them'
+        hint = 'add [devices.arm] with kind = "arm" and its driver; `panelwright doctor` lists them'
         faults.append(Fault("devices", "the cell has no arm", hint))
     for name, section in cell.file.devices.items():
         faults += [fault.below(f"devices.{name}") for fault in _faults_of(cell, name, section)]
@@ -124,7 +124,7 @@ def _faults_of(cell: Cell, name: str, section: DeviceSection) -> Iterator[Fault]
 
 
 def _other_driver(section: DeviceSection, is_kind: DeviceKind) -> str:
-    return f'give a driver of kind {section.kind} (`panelwright drivers`), or write kind = "{is_kind}"'
+    return f'give a driver of kind {section.kind} (`panelwright doctor` lists them), or write kind = "{is_kind}"'
 
 
 def _known_arm(cell: Cell) -> ArmCapabilities | None:

@@ -8,18 +8,19 @@ from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
     from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
-    from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
-    from perception.vision.teaching.panel_questions import kind_question, questions
-    from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
-    from perception.vision.teaching.teach import (
+    from perception.vision.teaching.lesson import (
         Example,
         Overview,
         check,
         example_at,
         likest,
         overview_of,
+        teach,
         teach_example,
     )
+    from perception.vision.teaching.panel_lights import LightsFound, find_border_lights
+    from perception.vision.teaching.panel_questions import kind_question, questions
+    from perception.vision.teaching.panel_teach import PanelObjectDraft, object_row, panel_text
 
 __all__ = [
     "Example",
@@ -36,6 +37,7 @@ __all__ = [
     "overview_of",
     "panel_text",
     "questions",
+    "teach",
     "teach_example",
     "teach_from_panel",
 ]

@@ -28,7 +28,7 @@ from perception.vision.projection import CameraProjection, PanelProjection
 from perception.vision.reading import ObjectReading
 from perception.vision.registration.register import register
 from perception.vision.teaching.condense import worth_keeping
-from perception.vision.teaching.teach import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
+from perception.vision.teaching.lesson import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
 
 # A sub-object this near to an object's middle is that object's, whichever of them blind recognition takes.
 PART_M = 0.0067

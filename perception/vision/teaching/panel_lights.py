@@ -10,8 +10,8 @@ import numpy as np
 from hal.arrays import Array
 from hal.errors import InvalidRequest
 from perception.vision.finding.features import PLATE_PX_PER_M
+from perception.vision.teaching.lesson import Overview, plate_points
 from perception.vision.teaching.sub_object import sub_objects
-from perception.vision.teaching.teach import Overview, plate_points
 
 SIDES = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], float)
 LIGHT_INSET_M = 0.015  # where lights are put when none are seen: the file says that it is a guess

@@ -18,9 +18,9 @@ from hal.panel import Panel, Question
 from hal.panel.kinds import kind_model
 from hal.strict import validate
 from hal.toml_text import toml_text
+from perception.vision.teaching.lesson import Example, Overview, plate_points
 from perception.vision.teaching.panel_lights import LightsFound
 from perception.vision.teaching.panel_questions import questions
-from perception.vision.teaching.teach import Example, Overview, plate_points
 
 CORNERS = ("upper_left", "upper_right", "lower_right", "lower_left")
 

@@ -51,12 +51,12 @@ GOLDEN = {
     "no arm": (
         NO_ARM,
         "devices: the cell has no arm",
-        'add [devices.arm] with kind = "arm" and its driver; `panelwright drivers` lists them',
+        'add [devices.arm] with kind = "arm" and its driver; `panelwright doctor` lists them',
     ),
     "wrong kind": (
         WRONG_KIND,
         "devices.gripper.driver: 'sim:camera' is a camera, and kind is gripper",
-        'give a driver of kind gripper (`panelwright drivers`), or write kind = "camera"',
+        'give a driver of kind gripper (`panelwright doctor` lists them), or write kind = "camera"',
     ),
     "no mount": (
         NO_MOUNT,

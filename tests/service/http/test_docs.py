@@ -10,13 +10,13 @@ import httpx2
 from service.operations import OPERATIONS
 from service.problem import STATUS
 
-DOCS = Path(__file__).parents[3] / "docs"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "http.md"
 NOT_SHOWN = {"/v1/echo", "/v1/hold", "/v1/wait", "/v1/fail", "/v1/measure"}  # verbs of these tests
 
 
 def _documented() -> set[str]:
-    """Paths of docs/http.md; "`POST /v1/a`, `/v1/b`" counts for both."""
-    text = (DOCS / "http.md").read_text()
+    """Paths of the page about the API; "`POST /v1/a`, `/v1/b`" counts for both."""
+    text = PAGE.read_text(encoding="utf-8").replace("$TASK", "ID")
     found = re.findall(r"(?:localhost:846[01]|[` (])(/(?:v1/[\w{}./-]+|healthz|readyz|metrics))", text)
     return {path.rstrip(".").replace("/ID/", "/{task_id}/") for path in found}
 
@@ -29,14 +29,14 @@ def test_every_path_is_documented_and_every_documented_path_exists(client: httpx
 
 
 def test_every_status_of_an_error_is_documented() -> None:
-    text = (DOCS / "http.md").read_text()
+    text = PAGE.read_text(encoding="utf-8")
     assert not [int(status) for status in STATUS.values() if str(int(status)) not in text]
 
 
 def test_the_documented_ports_are_the_default_ones() -> None:
     from service.serve import Options
 
-    assert f"http://127.0.0.1:{Options().port}" in (DOCS / "http.md").read_text()
+    assert f"http://127.0.0.1:{Options().port}" in PAGE.read_text(encoding="utf-8")
 
 
 def test_every_verb_has_a_valid_example() -> None:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusion import ErrorBudget, PoseTolerance, TouchPlan
+from fusion import PoseTolerance, TouchPlan
+from fusion.shared_errors import ErrorBudget
 from hal.errors import NotFound, Stopped, Unreachable
 from hal.panel import load_panel
 from service.operations import sense

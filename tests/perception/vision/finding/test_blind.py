@@ -20,7 +20,7 @@ from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, spread_o
 from perception.vision.knowledge_files import load_knowledge, write_kind
 from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.projection import CameraProjection, PlateProjection
-from perception.vision.teaching.teach import check, example_at, overview_of, plate_points, teach, teach_example
+from perception.vision.teaching.lesson import check, example_at, overview_of, plate_points, teach, teach_example
 from tests.perception.vision.bench_panel import panel, scene
 
 PLATE = (0.60, 0.40)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from perception.vision.knowledge import Knowledge
 from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
-from perception.vision.teaching.teach import check, teach
+from perception.vision.teaching.lesson import check, teach
 from tests.perception.vision.bench_panel import panel, scene
 
 Canvas = NDArray[np.uint8]

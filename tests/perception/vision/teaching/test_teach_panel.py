@@ -19,10 +19,10 @@ from perception.vision.inspection import inspect_view
 from perception.vision.knowledge import NOTHING
 from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
+from perception.vision.teaching.lesson import Overview, example_at, likest, overview_of, teach, teach_example
 from perception.vision.teaching.panel_lights import find_border_lights
 from perception.vision.teaching.panel_questions import kind_question, questions
 from perception.vision.teaching.panel_teach import PanelObjectDraft, panel_text
-from perception.vision.teaching.teach import Overview, example_at, likest, overview_of, teach, teach_example
 from tests.perception.vision.bench_panel import SHOWN, panel, scene
 
 PLATE = (0.60, 0.40)
@@ -251,7 +251,7 @@ def test_a_second_example_takes_no_object_from_another_kind() -> None:
 def _found(image: np.ndarray, knowledge: object) -> set[str]:
     """Names of the panel's objects that are found with their right kind."""
     overview = overview_of(image, plate_m=PLATE)
-    from perception.vision.teaching.teach import check
+    from perception.vision.teaching.lesson import check
 
     hits = [c for c in check(image, knowledge, plate_m=PLATE, view=overview.view) if c.reason is None]
     return {

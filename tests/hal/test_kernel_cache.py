@@ -53,7 +53,8 @@ class Project:
 
     def run(self) -> list[str]:
         """Call the kernel: its answer, whether it was compiled, and how many were missing before and after."""
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(self.kernels)}
+        # A command that another test of this process ran may have asked for a path without the script's folder.
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(self.kernels), "PYTHONSAFEPATH": ""}
         done = subprocess.run(
             [sys.executable, "caller.py"], cwd=self.folder, env=environment, capture_output=True, text=True, check=False
         )

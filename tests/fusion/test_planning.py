@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion import ErrorBudget, Observation, PoseTolerance, TouchObservation, error_budget
+from fusion import Observation, PoseTolerance, TouchObservation, error_budget
 from fusion.planning import CandidateSensing, next_measurement
-from fusion.shared_errors import fuse_observations
+from fusion.shared_errors import ErrorBudget, fuse_observations
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, point_covariance
 from tests.fusion.test_shared_errors import BASE_FROM_PANEL, MOUNTS, draw

@@ -1,1 +1,1 @@
-"""The far side of each wire: real protocols answered with what any HAL device says, with fault injection."""
+"""Emulated devices: each speaks a real protocol, takes its values from any HAL device and can inject faults."""

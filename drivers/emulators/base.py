@@ -1,4 +1,4 @@
-"""The thread of an emulator: takes requests, sends frames, and damages them as its fault plan says."""
+"""Base class of all emulators: one thread that receives requests, sends frames and damages them as its fault plan says."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ BACKING_S = 0.2
 
 
 def time_of(sample: Stamped[Any]) -> float:
-    """Seconds on the clock of the device behind; the machine's when it has none.
+    """Return the sample's time in seconds on the backing device's clock, or on the host's if the device has no clock.
 
-    A simulated world stands still while it draws a picture. Its arm does too, so that its watchdogs must not count on.
+    A simulated world stands still while it renders an image, and so does its arm. Watchdogs must therefore use the
+    world's clock, because on the host's clock they would trip.
     """
     return time.monotonic() if sample.device_time_s is None else sample.device_time_s
 
 
 class WireEmulator:
-    """Base of all emulators. The subclass gives `on_bytes` and, for devices that talk by themselves, `on_tick`."""
+    """Base of all emulators: the subclass defines `on_bytes` and, for devices that send unasked, `on_tick`."""
 
     period_s: float | None = None
 
@@ -48,25 +49,25 @@ class WireEmulator:
 
     @property
     def address(self) -> dict[str, Any]:
-        """Options that lead the real driver here."""
+        """Return the driver options that make the real driver connect to this emulator."""
         return self.port.address
 
     def begin(self) -> None:
-        """Start the thread; the last thing a factory does."""
+        """Start the thread; a factory calls this last."""
         self._thread.start()
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """A peer has sent bytes (none: it has just connected)."""
+        """Handle bytes from a peer; empty bytes mean that it has just connected."""
 
     def on_tick(self) -> None:
-        """Called every `period_s`."""
+        """Do the periodic work; called every `period_s`."""
 
     def status_frame(self) -> bytes | None:
-        """The device's error report in place of a frame, for the fault `status`; None when it has none."""
+        """Return the device's error report, sent in place of a frame by the fault `status`; None if it has no such report."""
         return None
 
     def unplug(self, *, away_s: float) -> None:
-        """Vanish and return; from any thread. Returns when the port is back (or the emulator closed)."""
+        """Take the port away for `away_s` seconds and wait until it is back or the emulator is closed; any thread may call."""
         if threading.current_thread() is self._thread:
             self._unplug_now(away_s)
             return
@@ -75,10 +76,10 @@ class WireEmulator:
         done.wait(away_s + 2.0)
 
     def inject(self, fault: Fault | None) -> None:
-        """Begin a fault of the conformance kit (silent or disconnected), or end it with None.
+        """Begin a fault of the conformance tests (silent or disconnected), or end it with None.
 
         Raises:
-            Unsupported: the fault belongs to the device behind, not to the wire.
+            Unsupported: the fault concerns the backing device, not the link.
         """
         if fault not in (None, Fault.SILENT, Fault.DISCONNECTED):
             raise Unsupported(f"a wire cannot be {fault}", hint="inject it into the device behind the emulator")
@@ -97,21 +98,21 @@ class WireEmulator:
             self.port.appear()
 
     def close(self) -> None:
-        """End thread and port; a second call does nothing."""
+        """End the thread and close the port; a second call does nothing."""
         if not self._closing.is_set():
             self._closing.set()
             self._thread.join(2.0)
             self.port.close()
 
     def deadline(self) -> Deadline:
-        """For reads of the device behind the emulator."""
+        """Return a deadline for one read of the backing device."""
         return Deadline.after(self._clock, BACKING_S)
 
     def send(self, peer: Peer, frame: bytes, *, protected: slice = slice(None)) -> None:
         """Send one frame through the fault plan.
 
         Args:
-            protected: the part of the frame whose damage the protocol can see.
+            protected: part of the frame in which the protocol detects damage.
         """
         if self._is_silent or time.monotonic() < self._silent_until_s:
             return
@@ -122,7 +123,7 @@ class WireEmulator:
             self._damage(fault, peer, frame, protected)
 
     def reply(self, peer: Peer, data: bytes) -> None:
-        """Send what belongs to the set-up and not to the data, undamaged unless silent."""
+        """Send a set-up answer: it is never damaged, but suppressed while the emulator is silent."""
         if not self._is_silent:
             self.port.send(peer, data)
 
@@ -182,7 +183,7 @@ class WireEmulator:
         try:
             self.on_bytes(peer, data)
         except CellError:
-            return  # the device behind says nothing, so neither does the wire
+            return  # the backing device does not answer, so the emulator does not either
 
     def _guarded_tick(self) -> None:
         try:

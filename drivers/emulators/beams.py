@@ -1,4 +1,4 @@
-"""A line of distances out of any range scanner: what a 2-D scanner in its place would see."""
+"""Converts a range image into the distances that a 2-D line scanner in the same place would measure."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from hal.devices import RangeImage, RangeScannerCapabilities
 
 
 def line_m(image: RangeImage, c: RangeScannerCapabilities, angle_rad: Array) -> Array:
-    """Distance along each beam at `angle_rad` about the sensor's y axis, from the image's middle row; NaN outside it.
+    """Return the distance along each beam at `angle_rad` about the sensor's y axis, in metres.
 
-    Pinhole: u = cx + fx tan(a), distance = z / cos(a). Orthographic images have no beams from one point: their columns
-    are taken where the beam meets the depth at that column's place, which is exact for a plane square to the view.
+    The distances come from the image's middle row; beams outside the image are NaN.
+
+    Pinhole: u = cx + fx tan(a), distance = z / cos(a). The beams of an orthographic image do not start at one point, so
+    its column is found from the row's median depth, which is exact for a plane at a right angle to the view.
     """
     row = image.depth_m[c.height // 2].astype(np.float64)
     if c.projection == "polar":
@@ -29,7 +31,7 @@ def line_m(image: RangeImage, c: RangeScannerCapabilities, angle_rad: Array) -> 
 
 
 def _at(row: Array, column: Array) -> Array:
-    """The nearest pixel; NaN beyond the ends."""
+    """Return the nearest pixel of `row` for each column; NaN beyond its ends."""
     nearest = np.round(column)
     is_inside = np.isfinite(nearest) & (nearest >= 0) & (nearest < len(row))
     return np.where(is_inside, row[np.where(is_inside, nearest, 0).astype(np.int64)], np.nan)

@@ -1,4 +1,4 @@
-"""Bota SensONE on a pty, with what a force/torque device of any kind measures."""
+"""Emulated Bota SensONE on a pty; any force/torque device supplies the wrench."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class BotaEmulatorOptions(FaultOptions):
 
 
 class BotaEmulator(WireEmulator):
-    """The sensor, running."""
+    """Running emulator of the sensor."""
 
     def __init__(self, backing: ForceTorque, options: BotaEmulatorOptions) -> None:
         super().__init__(PtyPort("bota"), options, name="bota")
@@ -38,16 +38,16 @@ class BotaEmulator(WireEmulator):
         self.is_running = True
 
     def stamp_us(self) -> int:
-        """The sensor's 32-bit clock."""
+        """Return the sensor's 32-bit clock, in microseconds."""
         return (self._clock_start_us + int((time.monotonic() - self._start_s) * 1e6)) & 0xFFFFFFFF
 
     def restart(self) -> None:
-        """Power-up: it says so and waits in set-up mode."""
+        """Act as after power-up: announce it and wait in set-up mode."""
         self.is_running = False
         self.reply(None, b"App Init\r\n")
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Commands, each written at once, with or without the end of a line."""
+        """Carry out the commands; each arrives in one piece, with or without a line end."""
         for line in data.split():
             self._command(peer, line)
 
@@ -64,12 +64,12 @@ class BotaEmulator(WireEmulator):
         self.reply(peer, f"r,0,{code},0\r\n".encode())
 
     def on_tick(self) -> None:
-        """One frame."""
+        """Send one frame while running."""
         if self.is_running:
             self.send(None, self._frame(0))
 
     def status_frame(self) -> bytes | None:
-        """A frame that says: invalid."""
+        """Return a frame with the status bit for invalid data."""
         return self._frame(INVALID)
 
     def _frame(self, status: int) -> bytes:
@@ -77,13 +77,13 @@ class BotaEmulator(WireEmulator):
 
 
 def frame(wrench: Wrench, status: int, stamp_us: int) -> bytes:
-    """AA status16 6 f32, u32 microseconds, f32 degrees, CRC."""
+    """Return one frame: AA, u16 status, six f32 of force and torque, u32 microseconds, f32 degrees Celsius, CRC."""
     body = struct.pack("<H6fIf", status, *wrench.force_n, *wrench.torque_nm, stamp_us, TEMPERATURE_C)
     return b"\xaa" + body + struct.pack("<H", crc_x25(body))
 
 
 def start(backing: Device, options: dict[str, Any]) -> BotaEmulator:
-    """Entry point `bota`."""
+    """Start the emulator on a force/torque device (entry point `bota`)."""
     if not isinstance(backing, ForceTorque):
         raise Unsupported(f"a SensONE cannot stand for a {backing.kind}", hint="back it with a force/torque device")
     emulator = BotaEmulator(backing, validate(options, BotaEmulatorOptions, source="emulators.bota"))

@@ -1,4 +1,4 @@
-"""Six CiA-402 drives behind an slcan adapter, on a pty or TCP, moving an arm of any backend."""
+"""Emulated CiA-402 drives behind an slcan adapter, on a pty or TCP; they move an arm of any backend."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Drive:
         self._last_control = 0
 
     def control(self, word: int) -> None:
-        """One control word (CiA 402-2, table 29)."""
+        """Apply one control word to the state machine (CiA 402-2, table 29)."""
         is_reset = bool(word & 0x80) and not self._last_control & 0x80
         self._last_control = word
         if self.state is DriveState.FAULT:
@@ -89,12 +89,12 @@ class Drive:
 
     @property
     def status(self) -> int:
-        """Object 6041h."""
+        """Return the status word, object 6041h."""
         return STATUS[self.state]
 
 
 class Cia402Emulator(WireEmulator):
-    """The six drives, running."""
+    """Running emulator of one drive per joint of the backing arm."""
 
     def __init__(self, backing: Arm, options: Cia402EmulatorOptions) -> None:
         super().__init__(TcpPort() if options.transport == "tcp" else PtyPort("slcan"), options, name="cia402")
@@ -111,21 +111,21 @@ class Cia402Emulator(WireEmulator):
 
     @property
     def address(self) -> dict[str, Any]:
-        """Channel, nodes and kinematics."""
+        """Return the driver options: channel, node numbers and kinematics."""
         c = self._backing.capabilities()
         far = self.port.address
         channel = f"tcp://{far['host']}:{far['port']}" if "host" in far else far["port"]
         return {"channel": channel, "nodes": list(self.nodes), "kinematics": kinematics_of(c)}
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """slcan commands are acknowledged; frames are obeyed."""
+        """Acknowledge slcan commands and carry out CAN frames."""
         if b"O\r" in data:
             self.reply(peer, b"\r")
         for frame in self._codec.feed(data):
             self._frame(frame)
 
     def on_tick(self) -> None:
-        """The drives' watch over the host's heartbeat."""
+        """Check the host's heartbeat; all drives fault when it is overdue."""
         self._device_s = time_of(self._backing.read_state(deadline=self.deadline()))
         is_late = self._host_s is not None and self._device_s - self._host_s > self._consumer_s
         if is_late and self._consumer_s > 0.0:
@@ -133,7 +133,7 @@ class Cia402Emulator(WireEmulator):
             self.fault(HOST_LOST)
 
     def fault(self, code: int) -> None:
-        """All drives fault and brake, and say why."""
+        """Put all drives into the fault state, stop the arm, and send the error `code` in emergency messages."""
         for node, drive in self.drives.items():
             drive.state = DriveState.FAULT
             drive.objects[(0x603F, 0)] = struct.pack("<H", code)
@@ -141,13 +141,13 @@ class Cia402Emulator(WireEmulator):
         self._settle()
 
     def restart(self, node: int) -> None:
-        """A drive was switched off and on."""
+        """Restart one drive, as after a power cycle, and send its boot-up message."""
         self.drives[node] = Drive()
         self._settle()
         self._out(0x700 + node, b"\x00")
 
     def status_frame(self) -> bytes | None:
-        """An emergency: over-current in the first drive."""
+        """Return an emergency message that reports over-current in the first drive."""
         return self._codec.encode(CanFrame(0x80 + self.nodes[0], struct.pack("<HB5x", 0x2310, 0x02)))
 
     def _frame(self, frame: CanFrame) -> None:
@@ -204,7 +204,7 @@ class Cia402Emulator(WireEmulator):
                 self._out(0x280 + node, struct.pack("<ih", round(float(state.velocity_rad_per_s[i]) / RAD), 0))
 
     def _settle(self) -> None:
-        """The arm behind follows while all drives are enabled, and is stopped when one is not."""
+        """Enable the backing arm when all drives are enabled, and stop it when one no longer is."""
         states = {drive.state for drive in self.drives.values()}
         is_allowed = states == {DriveState.OPERATION_ENABLED}
         if is_allowed and not self._is_moving_allowed:
@@ -214,12 +214,12 @@ class Cia402Emulator(WireEmulator):
         self._is_moving_allowed = is_allowed
 
     def _out(self, id_: int, data: bytes) -> None:
-        # The bus itself checks frames (CRC-15), so a damaged one never reaches the adapter.
+        # A CAN bus checks its frames itself (CRC-15), so a damaged one never reaches the adapter.
         self.send(None, self._codec.encode(CanFrame(id_, data)), protected=slice(0, 0))
 
 
 def start(backing: Device, options: dict[str, Any]) -> Cia402Emulator:
-    """Entry point `cia402`."""
+    """Start the emulator on an arm (entry point `cia402`)."""
     if not isinstance(backing, Arm):
         raise Unsupported(f"six drives cannot stand for a {backing.kind}", hint="back them with an arm")
     emulator = Cia402Emulator(backing, validate(options, Cia402EmulatorOptions, source="emulators.cia402"))

@@ -1,4 +1,4 @@
-"""Dynamixel servos on a pty: tables, sync reads and writes, watchdog, shutdown, moving any arm."""
+"""Emulated Dynamixel servos on a pty, moving any arm: control tables, sync reads and writes, watchdog, shutdown."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ OVERLOAD = 0x20
 
 
 class Servo:
-    """One control table."""
+    """Control table of one servo."""
 
     def __init__(self, id_: int) -> None:
         self.table = bytearray(TABLE_BYTES)
         self.table[0:2] = (1020).to_bytes(2, "little")
         self.table[6], self.table[7], self.table[11], self.table[68] = 45, id_, 3, 2
-        self.heard_s = -math.inf  # on the clock of the arm behind
+        self.heard_s = -math.inf  # time of the last packet, on the backing arm's clock
 
     def write(self, address: int, data: bytes) -> int:
-        """The error number of a write: 0 when it is done."""
+        """Write to the table and return the error number; 0 means done."""
         if address + len(data) > TABLE_BYTES:
             return RANGE
         if address < EEPROM_BYTES and self.table[TORQUE]:
@@ -51,17 +51,17 @@ class Servo:
 
     @property
     def goal(self) -> int:
-        """Goal position in counts."""
+        """Return the goal position in counts."""
         return int.from_bytes(self.table[GOAL : GOAL + 4], "little", signed=True)
 
     @property
     def alert(self) -> int:
-        """The alert bit while a hardware error stands."""
+        """Return the alert bit while a hardware error is present, else 0."""
         return protocol.ALERT if self.table[HARDWARE_ERROR] else 0
 
 
 class DynamixelEmulator(WireEmulator):
-    """The servos, running."""
+    """Running emulator of one servo per joint of the backing arm."""
 
     def __init__(self, backing: Arm, options: FaultOptions) -> None:
         super().__init__(PtyPort("dynamixel"), options, name="dynamixel")
@@ -76,17 +76,17 @@ class DynamixelEmulator(WireEmulator):
 
     @property
     def address(self) -> dict[str, Any]:
-        """Port, ids and kinematics."""
+        """Return the driver options: port, servo identifiers and kinematics."""
         return {**super().address, "ids": list(self.servos), "kinematics": kinematics_of(self._backing.capabilities())}
 
     def overload(self, id_: int) -> None:
-        """The servo shuts down."""
+        """Shut one servo down with an overload error."""
         self.servos[id_].table[HARDWARE_ERROR] = OVERLOAD
         self.servos[id_].table[TORQUE] = 0
         self._settle()
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:  # noqa: ARG002  # a line has one peer
-        """Instructions; every packet feeds the watchdogs."""
+        """Carry out the instructions; every packet restarts the watchdogs."""
         for frame in self._framer.feed(data):
             packet = protocol.decode(frame)
             if packet.instruction == protocol.STATUS:
@@ -97,7 +97,7 @@ class DynamixelEmulator(WireEmulator):
         self._settle()
 
     def on_tick(self) -> None:
-        """The bus watchdogs."""
+        """Trip the watchdog of every servo whose time without a packet has run out."""
         self._device_s = time_of(self._backing.read_state(deadline=self.deadline()))
         for servo in self.servos.values():
             limit = servo.table[WATCHDOG]
@@ -106,7 +106,7 @@ class DynamixelEmulator(WireEmulator):
         self._settle()
 
     def status_frame(self) -> bytes | None:
-        """Instruction error of the first servo."""
+        """Return an instruction error from the first servo."""
         return protocol.encode(next(iter(self.servos)), protocol.STATUS, bytes([INSTRUCTION]))
 
     def _obey(self, packet: protocol.Packet) -> None:
@@ -149,7 +149,7 @@ class DynamixelEmulator(WireEmulator):
         self.send(None, protocol.encode(id_, protocol.STATUS, bytes([error]) + data), protected=slice(4, None))
 
     def _fast_answer(self, parameters: bytes) -> None:
-        """One packet for all, unstuffed, with a running CRC after each servo's block."""
+        """Answer a fast sync read: one packet for all servos, without byte stuffing, with a running CRC after each block."""
         address, length = struct.unpack_from("<HH", parameters)
         ids = [id_ for id_ in parameters[4:] if id_ in self.servos]
         if len(ids) != len(parameters) - 4:
@@ -176,7 +176,7 @@ class DynamixelEmulator(WireEmulator):
         return bytes(self.servos[id_].table[address : address + length])
 
     def _refresh(self) -> None:
-        """Present values from the arm behind."""
+        """Copy position and velocity from the backing arm into the control tables."""
         try:
             state = self._backing.read_state(deadline=self.deadline()).value
         except CellError:
@@ -189,7 +189,7 @@ class DynamixelEmulator(WireEmulator):
             servo.table[TICK : TICK + 2] = tick.to_bytes(2, "little")
 
     def _settle(self) -> None:
-        """The arm behind follows while all servos have torque and no watchdog has tripped."""
+        """Let the backing arm follow the goals while all servos have torque and no watchdog has tripped; else stop it."""
         is_on = all(s.table[TORQUE] and s.table[WATCHDOG] != 0xFF for s in self.servos.values())
         if is_on and not self._is_enabled:
             self._backing.enable(deadline=self.deadline())
@@ -203,7 +203,7 @@ class DynamixelEmulator(WireEmulator):
 
 
 def start(backing: Device, options: dict[str, Any]) -> DynamixelEmulator:
-    """Entry point `dynamixel`."""
+    """Start the emulator on an arm (entry point `dynamixel`)."""
     if not isinstance(backing, Arm):
         raise Unsupported(f"servos cannot stand for a {backing.kind}", hint="back them with an arm")
     emulator = DynamixelEmulator(backing, validate(options, FaultOptions, source="emulators.dynamixel"))

@@ -1,4 +1,4 @@
-"""One Dynamixel servo on a pty that works a gripper of any kind: control table, current, watchdog."""
+"""Emulated Dynamixel servo on a pty that moves any gripper: control table, current limit, watchdog."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TICKS = 32_768
 
 
 class DynamixelGripperEmulator(WireEmulator):
-    """The servo, running."""
+    """Running emulator of the servo."""
 
     def __init__(self, backing: Gripper, options: FaultOptions) -> None:
         super().__init__(PtyPort("dynamixel-gripper"), options, name="dynamixel_gripper")
@@ -35,11 +35,11 @@ class DynamixelGripperEmulator(WireEmulator):
 
     @property
     def address(self) -> dict[str, Any]:
-        """Port, and the stroke of the gripper behind."""
+        """Return the driver options: port and stroke of the backing gripper."""
         return {**super().address, "stroke_m": self._backing.capabilities().max_width_m}
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:  # noqa: ARG002  # a line has one peer
-        """Instructions to the servo."""
+        """Carry out the instructions addressed to the servo."""
         for frame in self._framer.feed(data):
             packet = protocol.decode(frame)
             if packet.id == ID and packet.instruction != protocol.STATUS:
@@ -47,7 +47,7 @@ class DynamixelGripperEmulator(WireEmulator):
                 self._answer(error, answer)
 
     def status_frame(self) -> bytes | None:
-        """Instruction error."""
+        """Return an instruction error."""
         return protocol.encode(ID, protocol.STATUS, bytes([INSTRUCTION]))
 
     def _answer(self, error: int, data: bytes) -> None:
@@ -84,7 +84,7 @@ class DynamixelGripperEmulator(WireEmulator):
         )
 
     def _refresh(self) -> None:
-        """Present current, velocity and position from the gripper behind."""
+        """Copy current, velocity and position of the backing gripper into the control table."""
         c, held = self._backing.capabilities(), self._backing.read_state(deadline=self.deadline()).value
         position = round(CLOSED_COUNT + held.width_m / c.max_width_m * (OPEN_COUNT - CLOSED_COUNT))
         current = -int.from_bytes(self.servo.table[GOAL_CURRENT : GOAL_CURRENT + 2], "little") if held.is_holding else 0
@@ -95,7 +95,7 @@ class DynamixelGripperEmulator(WireEmulator):
 
 
 def start(backing: Device, options: dict[str, Any]) -> DynamixelGripperEmulator:
-    """Entry point `dynamixel_gripper`."""
+    """Start the emulator on a gripper (entry point `dynamixel_gripper`)."""
     if not isinstance(backing, Gripper):
         raise Unsupported(f"a gripper cannot stand for a {backing.kind}", hint="back it with a gripper")
     parsed = validate(options, FaultOptions, source="emulators.dynamixel_gripper")

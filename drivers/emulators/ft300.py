@@ -1,4 +1,4 @@
-"""Robotiq FT 300 on a pty: Modbus registers and the stream, with what a force/torque device of any kind measures."""
+"""Emulated Robotiq FT 300 on a pty: Modbus registers and stream; any force/torque device supplies the wrench."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from hal.strict import validate
 
 UNIT = 9
 WRENCH, FIRMWARE, STREAM = 180, 500, 410
-STOP_BYTES = 200  # FF bytes in a row that end the stream
+STOP_BYTES = 200  # this many consecutive FF bytes end the stream
 
 
 def counts(backing: ForceTorque) -> list[int]:
-    """Six signed counts of the newest wrench, within 16 bits."""
+    """Return the newest wrench as six signed counts, limited to 16 bits."""
     wrench = backing.read_wrench(deadline=Deadline.after(WallClock(), 0.2)).value
     scaled = np.concatenate((wrench.force_n * 100.0, wrench.torque_nm * 1000.0))
     return [int(c) for c in np.clip(np.round(scaled), -32768, 32767)]
 
 
 class Ft300Table(RegistersOnly):
-    """Registers 180-185, 500-502; writing 200h to 410 starts the stream."""
+    """Registers: 180-185 wrench, 500-502 firmware version; writing 200h to 410 starts the stream."""
 
     def __init__(self, backing: ForceTorque) -> None:
         self.backing = backing
         self.is_streaming = False
 
     def registers(self, address: int, count: int) -> Sequence[int]:
-        """Wrench or firmware."""
+        """Return registers of the wrench or of the firmware version."""
         if address >= FIRMWARE and address + count <= FIRMWARE + 3:
             return [1, 2, 3][address - FIRMWARE :][:count]
         if address >= WRENCH and address + count <= WRENCH + 6:
@@ -45,14 +45,14 @@ class Ft300Table(RegistersOnly):
         raise no_such(address, count)
 
     def write_registers(self, address: int, values: Sequence[int]) -> None:
-        """Only the stream register."""
+        """Start the stream; no other register can be written."""
         if address != STREAM or list(values) != [0x200]:
             raise no_such(address, *values)
         self.is_streaming = True
 
 
 class Ft300Emulator(ModbusFarSide):
-    """The sensor, running."""
+    """Running emulator of the sensor."""
 
     def __init__(self, backing: ForceTorque, options: FaultOptions) -> None:
         self.table = Ft300Table(backing)
@@ -61,7 +61,7 @@ class Ft300Emulator(ModbusFarSide):
         super().__init__(PtyPort("ft300"), options, self.table, unit=UNIT, name="ft300")
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Streaming, it hears only the end of the stream."""
+        """Answer requests; while streaming, only the sequence that ends the stream is recognised."""
         if not self.table.is_streaming:
             super().on_bytes(peer, data.lstrip(b"\xff"))
             return
@@ -70,23 +70,23 @@ class Ft300Emulator(ModbusFarSide):
             self.table.is_streaming, self._stop_bytes = False, 0
 
     def on_tick(self) -> None:
-        """One frame of the stream."""
+        """Send one frame while streaming."""
         if self.table.is_streaming:
             self.send(None, stream_frame(counts(self.table.backing)))
 
     def status_frame(self) -> bytes | None:
-        """Streaming it has no report; asked, it answers with an exception."""
+        """Return a Modbus exception, or None while streaming, because the stream cannot report errors."""
         return None if self.table.is_streaming else super().status_frame()
 
 
 def stream_frame(values: Sequence[int]) -> bytes:
-    """`20 4E`, six counts, CRC."""
+    """Return one frame of the stream: `20 4E`, six signed 16-bit counts, CRC."""
     body = b"\x20\x4e" + struct.pack("<6h", *values)
     return body + struct.pack("<H", crc_modbus(body))
 
 
 def start(backing: Device, options: dict[str, Any]) -> Ft300Emulator:
-    """Entry point `ft300`."""
+    """Start the emulator on a force/torque device (entry point `ft300`)."""
     if not isinstance(backing, ForceTorque):
         raise Unsupported(f"an FT 300 cannot stand for a {backing.kind}", hint="back it with a force/torque device")
     emulator = Ft300Emulator(backing, validate(options, FaultOptions, source="emulators.ft300"))

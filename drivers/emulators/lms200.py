@@ -1,4 +1,4 @@
-"""SICK LMS 200 on a pty, seeing what a range scanner of any kind sees."""
+"""Emulated SICK LMS 200 on a pty; any range scanner supplies the distances."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Lms200EmulatorOptions(FaultOptions):
 
 
 class Lms200Emulator(WireEmulator):
-    """The scanner, running; it hears only what is sent at its own baud rate."""
+    """Running emulator of the scanner; it understands only what is sent at its own baud rate."""
 
     def __init__(self, backing: RangeScanner, options: Lms200EmulatorOptions) -> None:
         self._pty = PtyPort("lms200")
@@ -48,7 +48,7 @@ class Lms200Emulator(WireEmulator):
         self._requests = framer(0)
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Telegrams at the right speed; anything else is noise to it."""
+        """Answer the telegrams sent at the current baud rate; at any other rate the bytes are noise."""
         if self._pty.speed() != SPEEDS[self.baud]:
             self._requests.reset()
             return
@@ -80,12 +80,12 @@ class Lms200Emulator(WireEmulator):
                 return b"\x92"
 
     def on_tick(self) -> None:
-        """One scan."""
+        """Send one scan while streaming."""
         if self.is_streaming:
             self.send(None, telegram(self._scan() + bytes([WELL]), address=0x80))
 
     def status_frame(self) -> bytes | None:
-        """A scan whose status says: fatal."""
+        """Return a scan whose status byte reports a fatal error."""
         return telegram(self._scan() + bytes([FATAL]), address=0x80)
 
     def _scan(self) -> bytes:
@@ -100,7 +100,7 @@ class Lms200Emulator(WireEmulator):
 
 
 def start(backing: Device, options: dict[str, Any]) -> Lms200Emulator:
-    """Entry point `lms200`."""
+    """Start the emulator on a range scanner (entry point `lms200`)."""
     if not isinstance(backing, RangeScanner):
         raise Unsupported(f"a scanner cannot stand for a {backing.kind}", hint="back it with a range scanner")
     emulator = Lms200Emulator(backing, validate(options, Lms200EmulatorOptions, source="emulators.lms200"))

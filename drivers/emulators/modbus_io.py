@@ -1,6 +1,7 @@
-"""Remote I/O with the Moxa ioLogik E1200 map and the cell's wiring, worked by lights, touch or proximity of any kind.
+"""Emulated remote I/O with the register map of the Moxa ioLogik E1200; a lights, touch or proximity device backs it.
 
-DO0-3 lights; DI0-3 their feedback; DI4/5 touch left/right; DI6 proximity switch; DI7 stop circuit (1 = healthy).
+Wiring of the cell: DO0-3 lights; DI0-3 their feedback; DI4/5 touch left/right; DI6 proximity switch; DI7 stop circuit
+(1 = healthy).
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ class ModbusIoOptions(FaultOptions):
 
 
 class IoTable:
-    """Eight outputs and eight inputs, some of them worked by a device of another backend."""
+    """Eight outputs and eight inputs, some of them connected to the backing device."""
 
     def __init__(self, backing: Device, switching_distance_m: float) -> None:
-        # What kind it is, is asked once: looking through a protocol takes 30 us.
+        # The kind is determined once, because an isinstance check against a protocol takes 30 us.
         self._lights = backing if isinstance(backing, Lights) else None
         self._touch = backing if isinstance(backing, Touch) else None
         self._proximity = backing if isinstance(backing, Proximity) else None
@@ -48,7 +49,7 @@ class IoTable:
         self._before = [False] * POINTS
 
     def inputs(self) -> list[bool]:
-        """DI0 to DI7 now."""
+        """Return the present states of DI0 to DI7 and count their rising edges."""
         now = [False] * 7 + [self.is_healthy]
         deadline = Deadline.after(self._clock, BACKING_S)
         if self._lights is not None:
@@ -66,14 +67,14 @@ class IoTable:
         return now
 
     def read_bits(self, function: int, address: int, count: int) -> Sequence[bool]:
-        """Coils 0-7 or discrete inputs 0-7."""
+        """Return coils 0-7 or discrete inputs 0-7."""
         if address + count > POINTS or count < 1:
             raise ModbusException(ILLEGAL_ADDRESS)
         points = self.outputs if function == 1 else self.inputs()
         return points[address : address + count]
 
     def read_registers(self, function: int, address: int, count: int) -> Sequence[int]:
-        """Input register 30h: DI word, 10h..: counters, high word first; holding register 20h: DO word."""
+        """Return registers: input 30h the DI word, input 10h and up the counters (high word first), holding 20h the DO word."""
         if (function, address, count) == (4, DI_WORD, 1):
             return [_word(self.inputs())]
         if (function, address, count) == (3, DO_WORD, 1):
@@ -84,7 +85,7 @@ class IoTable:
         raise ModbusException(ILLEGAL_ADDRESS)
 
     def write_bits(self, address: int, values: Sequence[bool]) -> None:
-        """Coils 0-7; the first four switch the lights."""
+        """Write coils 0-7; the first four switch the lights."""
         if address + len(values) > POINTS:
             raise ModbusException(ILLEGAL_ADDRESS)
         self.outputs[address : address + len(values)] = values
@@ -93,7 +94,7 @@ class IoTable:
             self._lights.set_on(self.outputs[:count], deadline=Deadline.after(self._clock, BACKING_S))
 
     def write_registers(self, address: int, values: Sequence[int]) -> None:
-        """Holding register 20h: all outputs."""
+        """Write holding register 20h, the word of all outputs."""
         if address != DO_WORD or len(values) != 1:
             raise ModbusException(ILLEGAL_ADDRESS)
         self.write_bits(0, [bool(values[0] >> i & 1) for i in range(POINTS)])
@@ -104,7 +105,7 @@ def _word(points: Sequence[bool]) -> int:
 
 
 class ModbusIoEmulator(ModbusFarSide):
-    """The remote I/O, running; `table` lets tests work inputs and look at outputs."""
+    """Running emulator of the remote I/O; tests use `table` to set inputs and check outputs."""
 
     def __init__(self, backing: Device, options: ModbusIoOptions) -> None:
         self.table = IoTable(backing, options.switching_distance_m)
@@ -113,7 +114,7 @@ class ModbusIoEmulator(ModbusFarSide):
 
 
 def start(backing: Device, options: dict[str, Any]) -> ModbusIoEmulator:
-    """Entry point `modbus_io`."""
+    """Start the emulator on any device (entry point `modbus_io`)."""
     emulator = ModbusIoEmulator(backing, validate(options, ModbusIoOptions, source="emulators.modbus_io"))
     emulator.begin()
     return emulator

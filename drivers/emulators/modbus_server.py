@@ -1,4 +1,4 @@
-"""Modbus far side for RTU and TCP: frames in, a register map's answers out."""
+"""Modbus server for RTU and TCP: answers request frames from a register map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MBAP = 7
 
 
 class ModbusException(Exception):
-    """The map refuses; `code` goes over the wire."""
+    """Refusal of a request by the register map; `code` is sent to the client."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code}")
@@ -26,58 +26,58 @@ class ModbusException(Exception):
 
 
 class RegisterMap(Protocol):
-    """What a Modbus device knows; each method raises `ModbusException` for addresses that it does not have."""
+    """Registers and bits of a Modbus device; each method raises `ModbusException` for an address that does not exist."""
 
     def read_bits(self, function: int, address: int, count: int) -> Sequence[bool]:
-        """Coils (1) or discrete inputs (2)."""
+        """Return coils (function 1) or discrete inputs (function 2)."""
         ...
 
     def read_registers(self, function: int, address: int, count: int) -> Sequence[int]:
-        """Holding (3) or input (4) registers, unsigned."""
+        """Return holding (function 3) or input (function 4) registers, unsigned."""
         ...
 
     def write_bits(self, address: int, values: Sequence[bool]) -> None:
-        """Coils."""
+        """Write coils."""
         ...
 
     def write_registers(self, address: int, values: Sequence[int]) -> None:
-        """Holding registers."""
+        """Write holding registers."""
         ...
 
 
 class RegistersOnly:
-    """A map without coils and inputs whose holding and input registers are the same."""
+    """Register map without coils and discrete inputs, with the same holding and input registers."""
 
     def registers(self, address: int, count: int) -> Sequence[int]:
-        """What stands from `address` on."""
+        """Return `count` registers from `address` on."""
         raise no_such(address, count)
 
     def write_registers(self, address: int, values: Sequence[int]) -> None:
-        """Take what the host writes."""
+        """Store the registers that the host writes."""
         raise no_such(address, *values)
 
     def read_registers(self, function: int, address: int, count: int) -> Sequence[int]:
-        """Both functions read the same."""
+        """Return the same registers for functions 3 and 4."""
         return self.registers(address, count) if function in (3, 4) else []
 
     def read_bits(self, function: int, address: int, count: int) -> Sequence[bool]:
-        """It has none."""
+        """Refuse: there are no coils or discrete inputs."""
         raise no_such(function, address, count)
 
     def write_bits(self, address: int, values: Sequence[bool]) -> None:
-        """It has none."""
+        """Refuse: there are no coils."""
         raise no_such(address, *values)
 
 
 def no_such(*asked: int) -> ModbusException:
-    """The refusal of an address; what was asked is kept for whoever debugs."""
+    """Return the exception for an illegal address; the request is attached as a note for debugging."""
     error = ModbusException(ILLEGAL_ADDRESS)
     error.add_note(f"asked: {asked}")
     return error
 
 
 class ModbusFarSide(WireEmulator):
-    """A server on a pty (RTU) or a listener (TCP)."""
+    """Modbus server on a pty (RTU) or a TCP listener."""
 
     def __init__(self, port: FarPort, options: FaultOptions, table: RegisterMap, *, unit: int, name: str) -> None:
         super().__init__(port, options, name=name)
@@ -103,7 +103,7 @@ class ModbusFarSide(WireEmulator):
         self._tcp[peer] = buffer
 
     def status_frame(self) -> bytes | None:
-        """Modbus exception 4: device failure."""
+        """Return Modbus exception 4, device failure, for RTU; None for TCP."""
         pdu = bytes([self._last_request[0] | 0x80, DEVICE_FAILURE])
         if self._is_rtu:
             return bytes([self._unit]) + pdu + struct.pack("<H", crc_modbus(bytes([self._unit]) + pdu))
@@ -120,7 +120,7 @@ class ModbusFarSide(WireEmulator):
 
 
 def answer_pdu(table: RegisterMap, pdu: bytes) -> bytes:
-    """The answer to one request, without unit and check sum (Modbus application protocol V1.1b3, chapter 6)."""
+    """Return the answer to one request, without unit and checksum (Modbus application protocol V1.1b3, chapter 6)."""
     function = pdu[0]
     if function not in (1, 2, 3, 4, 5, 6, 15, 16, 23):
         raise ModbusException(ILLEGAL_FUNCTION)
@@ -156,7 +156,7 @@ def _registers(function: int, values: Sequence[int]) -> bytes:
 
 
 def _rtu_request_length(data: bytes) -> int | None:
-    """Total length of the RTU request at the start of `data`."""
+    """Return the length of the RTU request at the start of `data`; None if not yet known, 0 if it is no request."""
     if len(data) < 2:
         return None
     function = data[1]

@@ -1,4 +1,4 @@
-"""ATI Net F/T on loopback UDP, with what a force/torque device of any kind measures."""
+"""Emulated ATI Net F/T on loopback UDP; any force/torque device supplies the wrench."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class NetftEmulatorOptions(FaultOptions):
 
 
 class NetftEmulator(WireEmulator):
-    """The sensor, running."""
+    """Running emulator of the sensor."""
 
     def __init__(self, backing: ForceTorque, options: NetftEmulatorOptions) -> None:
         super().__init__(UdpPort(options.udp_port), options, name="netft")
@@ -42,11 +42,11 @@ class NetftEmulator(WireEmulator):
 
     @property
     def is_streaming(self) -> bool:
-        """Has somebody asked for records?"""
+        """Return whether a client has requested records."""
         return self._peer is not None
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Start or stop."""
+        """Start or stop streaming on request."""
         if len(data) != 8:
             return
         header, command, count = struct.unpack(">HHI", data)
@@ -58,7 +58,7 @@ class NetftEmulator(WireEmulator):
             self._peer = None
 
     def on_tick(self) -> None:
-        """One record."""
+        """Send one record while streaming."""
         if self._peer is None:
             return
         self._sequence += 1
@@ -69,7 +69,7 @@ class NetftEmulator(WireEmulator):
                 self._peer = None
 
     def status_frame(self) -> bytes | None:
-        """A record that says: saturated."""
+        """Return a record with the status for saturation."""
         return self._record(STATUS_SATURATED)
 
     def _record(self, status: int) -> bytes:
@@ -80,7 +80,7 @@ class NetftEmulator(WireEmulator):
 
 
 def start(backing: Device, options: dict[str, Any]) -> NetftEmulator:
-    """Entry point `netft`."""
+    """Start the emulator on a force/torque device (entry point `netft`)."""
     if not isinstance(backing, ForceTorque):
         raise Unsupported(f"a Net F/T cannot stand for a {backing.kind}", hint="back it with a force/torque device")
     emulator = NetftEmulator(backing, validate(options, NetftEmulatorOptions, source="emulators.netft"))

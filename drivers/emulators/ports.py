@@ -1,4 +1,4 @@
-"""Far ends of wires: a pty under a stable name, a TCP listener, a UDP socket; all on this machine alone."""
+"""Ports of the emulators: a pty under a stable name, a TCP listener, a UDP socket; all reachable from this host only."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from pathlib import Path
 from typing import Any, Protocol
 
 LOOPBACK = "127.0.0.1"
-OUTPUT_SPEED = 5  # place in the list of `tcgetattr`
-Peer = Any  # whatever tells a port's peers apart: a connection, an address, nothing
+OUTPUT_SPEED = 5  # index in the list that `tcgetattr` returns
+Peer = Any  # identifies a peer of a port: a connection, an address, or None where there is only one
 
 
 class FarPort(Protocol):
-    """The emulator's end."""
+    """Port of an emulator, at the other end of the driver's link."""
 
     @property
     def address(self) -> dict[str, Any]:
-        """Options that lead a driver here."""
+        """Return the driver options that make a driver connect to this port."""
         ...
 
     def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
-        """What has come, by peer; waits at most `timeout_s`."""
+        """Return the received bytes of each peer; wait for at most `timeout_s` seconds."""
         ...
 
     def send(self, peer: Peer, data: bytes) -> None:
-        """Send, or lose the bytes when nobody takes them, as a real line does."""
+        """Send the bytes; they are lost if no one receives them, as on a real line."""
         ...
 
     def vanish(self) -> None:
-        """Unplug."""
+        """Unplug the port."""
         ...
 
     def appear(self) -> None:
-        """Plug in again."""
+        """Plug the port in again."""
         ...
 
     def close(self) -> None:
-        """End for good."""
+        """Close the port for good."""
         ...
 
 
 class PtyPort:
-    """A pseudo terminal whose slave is found under a symbolic link, as `/dev/serial/by-id` does it."""
+    """Pseudo terminal whose slave has a stable name by a symbolic link, as in `/dev/serial/by-id`."""
 
     def __init__(self, name: str) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
@@ -62,11 +62,11 @@ class PtyPort:
 
     @property
     def address(self) -> dict[str, Any]:
-        """`{"port": PATH}`"""
+        """Return `{"port": PATH}`."""
         return {"port": str(self.path)}
 
     def appear(self) -> None:
-        """A new pseudo terminal under the same name."""
+        """Open a new pseudo terminal under the same name."""
         master, slave = pty.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
@@ -76,14 +76,14 @@ class PtyPort:
         self._fds = (master, slave)  # the slave stays open here, so that the master never reads a hang-up
 
     def vanish(self) -> None:
-        """Hang up and take the name away."""
+        """Close the pseudo terminal and remove its name."""
         self.path.unlink(missing_ok=True)
         fds, self._fds = self._fds, None
         for fd in fds or ():
             os.close(fd)
 
     def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
-        """Bytes from whoever has the slave open."""
+        """Return the bytes written by the process that has the slave open."""
         if self._fds is None:
             time.sleep(max(0.0, timeout_s))
             return []
@@ -104,20 +104,20 @@ class PtyPort:
             os.write(self._fds[0], data)
 
     def speed(self) -> int:
-        """The speed that the driver has set, as a `termios` constant."""
+        """Return the baud rate that the driver has set, as a `termios` constant."""
         if self._fds is None:
             return 0
         attributes = termios.tcgetattr(self._fds[1])
         return int(attributes[OUTPUT_SPEED])
 
     def close(self) -> None:
-        """Hang up and remove the folder."""
+        """Close the pseudo terminal and remove its folder."""
         self.vanish()
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class TcpPort:
-    """A listener on loopback; each connection is a peer."""
+    """TCP listener on loopback; each connection is a peer."""
 
     def __init__(self, port: int = 0, *, key: str = "port") -> None:
         self._key = key
@@ -133,11 +133,11 @@ class TcpPort:
 
     @property
     def peers(self) -> tuple[socket.socket, ...]:
-        """Connections now open."""
+        """Return the open connections."""
         return tuple(self._peers)
 
     def appear(self) -> None:
-        """Listen, always on the same port."""
+        """Listen, always on the same port number."""
         listener = socket.socket()
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((LOOPBACK, self._port))
@@ -147,7 +147,7 @@ class TcpPort:
         self._listener = listener
 
     def vanish(self) -> None:
-        """Hang up on everybody and refuse new connections."""
+        """Close all connections and refuse new ones."""
         if self._listener is not None:
             self._listener.close()
         self._listener = None
@@ -156,7 +156,7 @@ class TcpPort:
         self._peers.clear()
 
     def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
-        """Bytes of each connection; a new connection comes with no bytes."""
+        """Return the received bytes of each connection; a new connection is reported with empty bytes."""
         if self._listener is None:
             time.sleep(max(0.0, timeout_s))
             return []
@@ -183,18 +183,18 @@ class TcpPort:
         return []
 
     def send(self, peer: Peer, data: bytes) -> None:
-        """To one connection, or to all when `peer` is None."""
+        """Send to one connection, or to all if `peer` is None."""
         for sock in self._peers if peer is None else [peer]:
             with suppress(OSError):
                 sock.sendall(data)
 
     def close(self) -> None:
-        """As `vanish`, for good."""
+        """Close all connections and the listener for good."""
         self.vanish()
 
 
 class UdpPort:
-    """A UDP socket on loopback; each sender's address is a peer."""
+    """UDP socket on loopback; each sender's address is a peer."""
 
     def __init__(self, port: int = 0) -> None:
         self._port = port
@@ -207,7 +207,7 @@ class UdpPort:
         return {"host": LOOPBACK, "port": self._port}
 
     def appear(self) -> None:
-        """Bind, always to the same port."""
+        """Bind, always to the same port number."""
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         sock.bind((LOOPBACK, self._port))
         sock.setblocking(False)
@@ -221,7 +221,7 @@ class UdpPort:
         self._sock = None
 
     def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
-        """One datagram."""
+        """Return at most one received datagram."""
         if self._sock is None:
             time.sleep(max(0.0, timeout_s))
             return []
@@ -234,7 +234,7 @@ class UdpPort:
         return [(peer, data)]
 
     def send(self, peer: Peer, data: bytes) -> None:
-        """One datagram to `peer`."""
+        """Send one datagram to `peer`."""
         if self._sock is None or peer is None or not data:
             return
         try:
@@ -244,5 +244,5 @@ class UdpPort:
                 raise
 
     def close(self) -> None:
-        """As `vanish`, for good."""
+        """Close the socket for good."""
         self.vanish()

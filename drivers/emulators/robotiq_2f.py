@@ -1,4 +1,4 @@
-"""Robotiq 2F gripper on a pty, worked by a gripper of any kind."""
+"""Emulated Robotiq 2F gripper on a pty, backed by any gripper."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Robotiq2FEmulatorOptions(FaultOptions):
 
 
 def min_force_n(backing: Gripper) -> float:
-    """What force count 0 means; no gripper of the family closes with less."""
+    """Return the force that count 0 stands for, in newtons: the smallest force with which this gripper family closes."""
     return min(MIN_FORCE_N, backing.capabilities().max_force_n)
 
 
 class Robotiq2FTable(RegistersOnly):
-    """Output registers 1000-1002, input registers 2000-2002."""
+    """Register map: output registers 1000-1002, input registers 2000-2002."""
 
     def __init__(self, backing: Gripper, activation_s: float) -> None:
         self.backing = backing
@@ -48,14 +48,14 @@ class Robotiq2FTable(RegistersOnly):
         self.fault = 0
 
     def registers(self, address: int, count: int) -> Sequence[int]:
-        """Status, or the output read back."""
+        """Return status registers, or output registers as they were written."""
         for base, words in ((OUTPUT, self.output), (INPUT, self._status())):
             if base <= address and address + count <= base + 3:
                 return words[address - base :][:count]
         raise no_such(address, count)
 
     def write_registers(self, address: int, values: Sequence[int]) -> None:
-        """Activate, or go to a position."""
+        """Activate the gripper or move it to a position."""
         if address < OUTPUT or address + len(values) > OUTPUT + 3:
             raise no_such(address, *values)
         self.output[address - OUTPUT : address - OUTPUT + len(values)] = values
@@ -95,7 +95,7 @@ class Robotiq2FTable(RegistersOnly):
 
 
 class Robotiq2FEmulator(ModbusFarSide):
-    """The gripper, running."""
+    """Running emulator of the gripper."""
 
     def __init__(self, backing: Gripper, options: Robotiq2FEmulatorOptions) -> None:
         self.table = Robotiq2FTable(backing, options.activation_s)
@@ -104,14 +104,14 @@ class Robotiq2FEmulator(ModbusFarSide):
 
     @property
     def address(self) -> dict[str, Any]:
-        """Port, and the range of the gripper behind."""
+        """Return the driver options: port, and stroke, speed and force limits of the backing gripper."""
         c = self.table.backing.capabilities()
         forces = {"min_force_n": min_force_n(self.table.backing), "max_force_n": c.max_force_n}
         return {**super().address, "stroke_m": c.max_width_m, "max_speed_m_per_s": c.max_speed_m_per_s, **forces}
 
 
 def start(backing: Device, options: dict[str, Any]) -> Robotiq2FEmulator:
-    """Entry point `robotiq_2f`."""
+    """Start the emulator on a gripper (entry point `robotiq_2f`)."""
     if not isinstance(backing, Gripper):
         raise Unsupported(f"a gripper cannot stand for a {backing.kind}", hint="back it with a gripper")
     emulator = Robotiq2FEmulator(backing, validate(options, Robotiq2FEmulatorOptions, source="emulators.robotiq_2f"))

@@ -1,4 +1,4 @@
-"""Slamtec RPLIDAR on a pty, seeing what a range scanner of any kind sees."""
+"""Emulated Slamtec RPLIDAR on a pty; any range scanner supplies the distances."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RplidarEmulatorOptions(FaultOptions):
 
 
 class RplidarEmulator(WireEmulator):
-    """The scanner, running; a turn goes out in one piece."""
+    """Running emulator of the scanner; it sends each revolution in one piece."""
 
     def __init__(self, backing: RangeScanner, options: RplidarEmulatorOptions) -> None:
         super().__init__(PtyPort("rplidar"), options, name="rplidar")
@@ -44,11 +44,11 @@ class RplidarEmulator(WireEmulator):
         self._buffer = b""
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Requests `A5 command`."""
+        """Answer the requests; each is `A5 command`, some with a payload."""
         self._buffer += data
         while (at := self._buffer.find(b"\xa5")) >= 0 and len(self._buffer) > at + 1:
             command, rest = self._buffer[at + 1], self._buffer[at + 2 :]
-            payload = 1 + rest[0] + 1 if command >= WITH_PAYLOAD and rest else 0  # its length, it, the check
+            payload = 1 + rest[0] + 1 if command >= WITH_PAYLOAD and rest else 0  # length byte, payload, checksum
             if len(rest) < payload or (command >= WITH_PAYLOAD and not rest):
                 return
             self._buffer = rest[payload:]
@@ -76,7 +76,7 @@ class RplidarEmulator(WireEmulator):
                 return
 
     def on_tick(self) -> None:
-        """One turn."""
+        """Send one revolution while scanning."""
         if self.is_scanning and self.is_express:
             self.send(None, self._turn())
         elif self.is_scanning:
@@ -95,7 +95,7 @@ class RplidarEmulator(WireEmulator):
 
 
 def encode_turn(angle_rad: np.ndarray[Any, Any], range_m: np.ndarray[Any, Any]) -> bytes:
-    """Five bytes a measurement; the first has the start flag."""
+    """Return a revolution as standard nodes of five bytes per measurement; the first has the start flag."""
     angle_q6 = np.round(np.degrees(angle_rad) * 64.0).astype(np.int64)
     distance_q2 = np.round(np.nan_to_num(range_m) * 4000.0).astype(np.int64)
     is_start = np.arange(len(angle_rad)) == 0
@@ -113,7 +113,7 @@ def encode_turn(angle_rad: np.ndarray[Any, Any], range_m: np.ndarray[Any, Any]) 
 
 
 def encode_capsules(range_m: np.ndarray[Any, Any], *, is_first: bool) -> bytes:
-    """A turn of evenly spaced measurements, a multiple of 32, without offsets."""
+    """Return a revolution as express capsules: evenly spaced, a multiple of 32 measurements, no angle corrections."""
     raw = np.round(np.nan_to_num(range_m) * 1000.0).astype(np.int64) << 2
     capsules = b""
     for at in range(0, len(raw), POINTS):
@@ -127,7 +127,7 @@ def encode_capsules(range_m: np.ndarray[Any, Any], *, is_first: bool) -> bytes:
 
 
 def start(backing: Device, options: dict[str, Any]) -> RplidarEmulator:
-    """Entry point `rplidar`."""
+    """Start the emulator on a range scanner (entry point `rplidar`)."""
     if not isinstance(backing, RangeScanner):
         raise Unsupported(f"a scanner cannot stand for a {backing.kind}", hint="back it with a range scanner")
     emulator = RplidarEmulator(backing, validate(options, RplidarEmulatorOptions, source="emulators.rplidar"))

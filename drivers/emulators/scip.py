@@ -1,4 +1,4 @@
-"""A Hokuyo scanner (URG-04LX geometry by default) on a pty or TCP, seeing what a range scanner of any kind sees."""
+"""Emulated Hokuyo scanner (by default a URG-04LX) on a pty or TCP; any range scanner supplies the distances."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ScipEmulatorOptions(FaultOptions):
 
 
 class ScipEmulator(WireEmulator):
-    """The scanner, running."""
+    """Running emulator of the scanner."""
 
     def __init__(self, backing: RangeScanner, options: ScipEmulatorOptions) -> None:
         port = PtyPort("scip") if options.transport == "serial" else TcpPort(options.tcp_port)
@@ -54,18 +54,18 @@ class ScipEmulator(WireEmulator):
         self._start_s = time.monotonic()
 
     def stamp_ms(self) -> int:
-        """The scanner's 24-bit clock."""
+        """Return the scanner's 24-bit clock, in milliseconds."""
         return (self._o.clock_start_ms + int((time.monotonic() - self._start_s) * 1000.0)) & STAMP_MASK
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Commands, line by line."""
+        """Carry out the commands, one per line."""
         *lines, self._buffers[peer] = (self._buffers.get(peer, b"") + data).split(b"\n")
         for line in lines:
             if line:
                 self._command(peer, line.decode("ascii", "replace"))
 
     def on_tick(self) -> None:
-        """One scan of the stream."""
+        """Send one scan while streaming."""
         if self._stream is None:
             return
         peer, echo = self._stream
@@ -77,7 +77,7 @@ class ScipEmulator(WireEmulator):
         self.send(peer, self._scan(echo, "99"))
 
     def status_frame(self) -> bytes | None:
-        """Status 72: hardware trouble."""
+        """Return a message with status 72, hardware trouble."""
         echo = self._stream[1] if self._stream is not None else "MD"
         return _message(echo, "72")
 
@@ -128,12 +128,12 @@ class ScipEmulator(WireEmulator):
 
 
 def encode_number(value: int, characters: int) -> bytes:
-    """Six bits a character, high first, plus 30h."""
+    """Return the number in SCIP encoding: six bits per character, high bits first, plus 30h."""
     return bytes((value >> 6 * i & 0x3F) + 0x30 for i in range(characters - 1, -1, -1))
 
 
 def encode_ranges(range_mm: NDArray[np.int64]) -> bytes:
-    """Three characters each."""
+    """Return the distances in SCIP encoding, three characters each."""
     shifted = np.stack([range_mm >> 12 & 0x3F, range_mm >> 6 & 0x3F, range_mm & 0x3F], axis=1)
     return (shifted + 0x30).astype(np.uint8).tobytes()
 
@@ -145,14 +145,14 @@ def _message(echo: str, status: str, lines: Iterable[bytes] = ()) -> bytes:
 
 
 def _listing(echo: str, values: Mapping[str, str | int]) -> bytes:
-    """`KEY:value;` lines, summed without the `;`: other people's clients insist on it."""
+    """Return lines `KEY:value;` whose checksum leaves out the `;`, because other clients require it."""
     lines = [f"{key}:{value}".encode() for key, value in values.items()]
     summed = [b"00" + bytes([sum_scip(b"00")]), *(line + b";" + bytes([sum_scip(line)]) for line in lines)]
     return b"\n".join([echo.encode(), *summed]) + b"\n\n"
 
 
 def start(backing: Device, options: dict[str, Any]) -> ScipEmulator:
-    """Entry point `scip`."""
+    """Start the emulator on a range scanner (entry point `scip`)."""
     if not isinstance(backing, RangeScanner):
         raise Unsupported(f"a scanner cannot stand for a {backing.kind}", hint="back it with a range scanner")
     emulator = ScipEmulator(backing, validate(options, ScipEmulatorOptions, source="emulators.scip"))

@@ -1,6 +1,7 @@
-"""Devices that exist in memory alone: what an emulator can stand on without a simulator.
+"""Devices in memory with predictable values, which back emulators without a simulator.
 
-Each sample tells its index (a value that rises by one step a read), so a test can tell true, stale and wrong apart.
+The value rises by one step per read, so it reveals the index of its sample, and a test can tell true, stale and wrong
+values apart.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ LIGHT_NAMES = ("top_left", "top_right", "bottom_right", "bottom_left")
 
 
 class Scripted:
-    """What all share: a name, a count of reads, a stamp from the clock."""
+    """Base of the scripted devices: a name, a count of reads, and time stamps from a clock."""
 
     kind: ClassVar[DeviceKind]
 
@@ -47,14 +48,18 @@ class Scripted:
         self._clock = clock or WallClock()
 
     def health(self) -> Health:
-        """Always well."""
+        """Return that the device is connected and its data are valid."""
         return Health(connected=True, quality=Quality.VALID, cause=Cause.NONE, samples=self.reads)
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing, because there is nothing to release."""
 
     def count(self, deadline: Deadline) -> tuple[int, float]:
-        """Index of this read and its time."""
+        """Count one read and return its index and its time in seconds.
+
+        Raises:
+            DeviceTimeout: the deadline is past.
+        """
         if deadline.is_past():
             raise DeviceTimeout(f"{self.name} was asked too late", hint="give it more time", device=self.name)
         self.reads += 1
@@ -62,7 +67,7 @@ class Scripted:
 
 
 class ScriptedProximity(Scripted):
-    """A saw tooth: `first_m` plus a millimetre a read, 1000 steps long; or `fixed_m`."""
+    """Distance that rises from `first_m` by 1 mm per read and starts again after 1000 reads; or the constant `fixed_m`."""
 
     kind = DeviceKind.PROXIMITY
 
@@ -72,11 +77,11 @@ class ScriptedProximity(Scripted):
         self.fixed_m = fixed_m
 
     def capabilities(self) -> ProximityCapabilities:
-        """Up to 12 m."""
+        """Return a range of 0 to 12 m."""
         return ProximityCapabilities(min_range_m=0.0, max_range_m=12.0, sigma_m=0.001, rate_hz=100.0)
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """The next step; NaN and invalid when `fixed_m` is NaN."""
+        """Return the next distance; an invalid sample if `fixed_m` is NaN."""
         index, now_s = self.count(deadline)
         value = self.first_m + 0.001 * (index % 1000) if self.fixed_m is None else self.fixed_m
         is_seen = math.isfinite(value)
@@ -90,7 +95,7 @@ class ScriptedProximity(Scripted):
 
 
 class ScriptedLights(Scripted):
-    """Four lamps whose feedback is what was commanded."""
+    """Four lights whose feedback equals the command."""
 
     kind = DeviceKind.LIGHTS
 
@@ -99,23 +104,23 @@ class ScriptedLights(Scripted):
         self.on: tuple[bool, ...] = (False,) * len(LIGHT_NAMES)
 
     def capabilities(self) -> LightsCapabilities:
-        """Four, at once."""
+        """Return four channels that settle in 10 ms."""
         return LightsCapabilities(channels=LIGHT_NAMES, settle_s=0.01)
 
     def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
-        """Switch."""
+        """Store the command and return it."""
         self.count(deadline)
         self.on = tuple(on)
         return self.on
 
     def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """What was commanded."""
+        """Return the last command as feedback."""
         index, now_s = self.count(deadline)
         return Stamped(value=self.on, host_time_s=now_s, sequence=index)
 
 
 class ScriptedTouch(Scripted):
-    """Two pads; `contacts` is theirs to set."""
+    """Two touch pads; tests set `contacts`."""
 
     kind = DeviceKind.TOUCH
 
@@ -124,17 +129,17 @@ class ScriptedTouch(Scripted):
         self.contacts: tuple[bool, ...] = (False, False)
 
     def capabilities(self) -> TouchCapabilities:
-        """Left and right."""
+        """Return the channels left and right."""
         return TouchCapabilities(channels=("left", "right"), threshold_n=1.0, rate_hz=100.0)
 
     def read_contacts(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """As set."""
+        """Return `contacts` as set."""
         index, now_s = self.count(deadline)
         return Stamped(value=self.contacts, host_time_s=now_s, sequence=index)
 
 
 class ScriptedForceTorque(Scripted):
-    """Fx counts reads in steps of 0.01 N over 250 N; the other five components are fixed functions of it."""
+    """Wrench whose Fx rises by 0.01 N per read up to 250 N; the other five components are fixed functions of Fx."""
 
     kind = DeviceKind.FORCE_TORQUE
 
@@ -142,19 +147,19 @@ class ScriptedForceTorque(Scripted):
         super().__init__("scripted_ft")
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        """300 N, 30 N m."""
+        """Return ranges of 300 N and 30 N m."""
         return ForceTorqueCapabilities(
             force_range_n=300.0, torque_range_nm=30.0, force_sigma_n=0.1, torque_sigma_nm=0.005, rate_hz=100.0
         )
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        """The next step."""
+        """Return the next wrench."""
         index, now_s = self.count(deadline)
         return Stamped(value=scripted_wrench(index), host_time_s=now_s, sequence=index)
 
 
 def scripted_wrench(index: int) -> Wrench:
-    """The wrench of read number `index`."""
+    """Return the wrench of read number `index`."""
     fx_n = 0.01 * (index % 25_000)
     return Wrench(
         force_n=np.array([fx_n, 100.0 - fx_n / 2.5, -0.5 * fx_n]),
@@ -163,7 +168,7 @@ def scripted_wrench(index: int) -> Wrench:
 
 
 class ScriptedGripper(Scripted):
-    """Jaws that move at the commanded speed; `object_m` is the width of a thing between them."""
+    """Gripper whose jaws move at the commanded speed; `object_m` is the width of the object between them."""
 
     kind = DeviceKind.GRIPPER
 
@@ -175,11 +180,11 @@ class ScriptedGripper(Scripted):
         self._since_s = 0.0
 
     def capabilities(self) -> GripperCapabilities:
-        """85 mm, 100 N, 0.15 m/s."""
+        """Return a stroke of 85 mm, 100 N and 0.15 m/s."""
         return GripperCapabilities(min_width_m=0.0, max_width_m=0.085, max_force_n=100.0, max_speed_m_per_s=0.15)
 
     def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
-        """Where the jaws are by now."""
+        """Return width, force and motion of the jaws at this time."""
         index, now_s = self.count(deadline)
         width_m = self._width_m(now_s)
         is_holding = self.object_m > 0.0 and width_m <= self.object_m + 1e-9
@@ -192,7 +197,7 @@ class ScriptedGripper(Scripted):
         return Stamped(value=state, host_time_s=now_s, sequence=index)
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:  # noqa: ARG002 - no wait
-        """Set off."""
+        """Start a motion and return the goal width, limited to the stroke, in metres."""
         _, now_s = self.count(deadline)
         self._from_m, self._since_s = self._width_m(now_s), now_s
         self._goal_m, self._speed_m_per_s = min(max(width_m, 0.0), 0.085), speed_m_per_s
@@ -205,7 +210,7 @@ class ScriptedGripper(Scripted):
 
 
 class ScriptedScanner(Scripted):
-    """A full turn of 721 beams, half a degree apart: beam i of read k is 0.5 m + i / 2 mm + (k mod 100) mm away."""
+    """Full turn of 721 beams, half a degree apart: beam i of read k measures 0.5 m + i / 2 mm + (k mod 100) mm."""
 
     kind = DeviceKind.RANGE_SCANNER
 
@@ -213,7 +218,7 @@ class ScriptedScanner(Scripted):
         super().__init__("scripted_scanner")
 
     def capabilities(self) -> RangeScannerCapabilities:
-        """-180 to 180 degrees."""
+        """Return the geometry of a polar scan from -180 to 180 degrees."""
         return RangeScannerCapabilities(
             projection="polar",
             width=721,
@@ -231,31 +236,31 @@ class ScriptedScanner(Scripted):
         )
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
-        """The next scan."""
+        """Return the next scan."""
         index, now_s = self.count(deadline)
         return Stamped(value=RangeImage(depth_m=scripted_scan(index)), host_time_s=now_s, sequence=index)
 
 
 def scripted_scan(index: int) -> NDArray[np.float32]:
-    """(1, 721) distances of read number `index`."""
+    """Return the (1, 721) distances of read number `index`, in metres."""
     return (0.5 + 0.0005 * np.arange(721) + 0.001 * (index % 100)).astype(np.float32)[np.newaxis, :]
 
 
 class ScriptedArm(Scripted):
-    """Six joints that are where they were last told to be, while enabled."""
+    """Arm of six joints that, while enabled, reaches each commanded position at once."""
 
     kind = DeviceKind.ARM
 
     def __init__(self, *, device_s: float | None = None) -> None:
         super().__init__("scripted_arm")
-        self.device_s = device_s  # the time on its own clock, which tests let pass; None: it has none
+        self.device_s = device_s  # time on the arm's own clock, advanced by tests; None: it has no clock
         self.position_rad = np.array([0.1, -1.2, 1.3, -0.4, 0.5, 0.6])
         self.is_enabled = False
         self.commands = 0
         self.stops = 0
 
     def capabilities(self) -> ArmCapabilities:
-        """A plain six-joint arm."""
+        """Return the capabilities of a simple six-joint arm."""
         return ArmCapabilities(
             model="scripted",
             links=tuple(DhLink(d_m=0.1, a_m=0.2, alpha_rad=0.5) for _ in range(6)),
@@ -269,7 +274,7 @@ class ScriptedArm(Scripted):
         )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Where it is."""
+        """Return the present position."""
         index, now_s = self.count(deadline)
         state = JointState(
             position_rad=self.position_rad.copy(), velocity_rad_per_s=np.zeros(6), is_enabled=self.is_enabled
@@ -277,7 +282,11 @@ class ScriptedArm(Scripted):
         return Stamped(value=state, host_time_s=now_s, sequence=index, device_time_s=self.device_s)
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
-        """Jump there."""
+        """Jump to the position.
+
+        Raises:
+            MotionRefused: the arm is not enabled.
+        """
         self.count(deadline)
         if not self.is_enabled:
             raise MotionRefused("the scripted arm is off", hint="call enable first", device=self.name)
@@ -286,12 +295,12 @@ class ScriptedArm(Scripted):
         return self.position_rad
 
     def enable(self, *, deadline: Deadline) -> None:
-        """Follow from now on."""
+        """Enable the arm."""
         self.count(deadline)
         self.is_enabled = True
 
     def stop(self, *, deadline: Deadline) -> None:
-        """Follow no more."""
+        """Disable the arm."""
         self.count(deadline)
         self.stops += 1
         self.is_enabled = False

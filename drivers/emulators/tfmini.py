@@ -1,4 +1,4 @@
-"""Benewake TFmini-Plus: 100 frames a second with what a proximity device of any backend measures; answers commands."""
+"""Emulated Benewake TFmini-Plus: sends 100 frames per second from any proximity device and answers commands."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TfminiEmulatorOptions(FaultOptions):
 
 
 class TfminiEmulator(WireEmulator):
-    """The sensor, running on a pty."""
+    """Running emulator of the sensor, on a pty."""
 
     def __init__(self, backing: Proximity, options: TfminiEmulatorOptions) -> None:
         super().__init__(PtyPort("tfmini"), options, name="tfmini")
@@ -39,7 +39,7 @@ class TfminiEmulator(WireEmulator):
         self.is_mm = False
 
     def on_tick(self) -> None:
-        """One measurement."""
+        """Send one measurement."""
         sample = self._backing.read_distance_m(deadline=self.deadline())
         is_seen = sample.quality is not Quality.INVALID
         per_m = 1000.0 if self.is_mm else 100.0
@@ -47,11 +47,11 @@ class TfminiEmulator(WireEmulator):
         self.send(None, data_frame(raw, STRONG if is_seen else WEAK))
 
     def status_frame(self) -> bytes | None:
-        """Too weak a signal: the sensor's way to say that the distance is no distance."""
+        """Return a frame with too weak a signal, by which the sensor marks a distance as invalid."""
         return data_frame(0, WEAK)
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Commands: version, rate, unit, output, save."""
+        """Carry out the commands for version, rate, unit, output and save."""
         for frame in self._commands.feed(data):
             answer = self._carry_out(frame[2], frame[3:-1])
             if answer:
@@ -74,7 +74,7 @@ class TfminiEmulator(WireEmulator):
 
 
 def data_frame(raw: int, strength: int) -> bytes:
-    """`59 59 dist16 strength16 temp16 sum8`."""
+    """Return one frame: `59 59`, distance, strength and temperature of 16 bits each, 8-bit checksum."""
     body = b"\x59\x59" + struct.pack("<HHH", raw, strength, TEMPERATURE_RAW)
     return body + bytes([sum_low_byte(body)])
 
@@ -84,7 +84,7 @@ def _sum_is_right(frame: bytes) -> bool:
 
 
 def start(backing: Device, options: dict[str, Any]) -> TfminiEmulator:
-    """Entry point `tfmini`."""
+    """Start the emulator on a proximity device (entry point `tfmini`)."""
     if not isinstance(backing, Proximity):
         raise Unsupported(f"a tfmini cannot stand for a {backing.kind}", hint="back it with a proximity device")
     emulator = TfminiEmulator(backing, validate(options, TfminiEmulatorOptions, source="emulators.tfmini"))

@@ -1,4 +1,4 @@
-"""Benewake TFmini-i on a pty, as a Modbus slave or behind an slcan adapter, measuring as a proximity device does."""
+"""Emulated Benewake TFmini-i on a pty, as a Modbus slave or behind an slcan adapter, backed by any proximity device."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TfminiIOptions(FaultOptions):
 
 
 class Measurement:
-    """What the sensor knows, renewed `rate_hz` times a second: distance in cm, strength, its clock in ms."""
+    """Newest measurement, renewed `rate_hz` times per second: distance in cm, strength, sensor clock in ms."""
 
     def __init__(self, backing: Proximity, options: TfminiIOptions) -> None:
         self._backing = backing
@@ -47,7 +47,7 @@ class Measurement:
         self._clock = WallClock()
 
     def newest(self) -> tuple[int, int, int]:
-        """The measurement of this period."""
+        """Return distance (cm), strength and clock (ms) of the present period."""
         index = int((time.monotonic() - self._start_s) / self._period_s)
         if index != self._index:
             self._index = index
@@ -59,13 +59,13 @@ class Measurement:
 
 
 class TfminiITable(RegistersOnly):
-    """Registers 0-4 measurement and clock, 6-7 firmware; 80h-86h settings are taken and forgotten."""
+    """Registers: 0-4 measurement and clock, 6-7 firmware version; writes to the settings 80h-86h have no effect."""
 
     def __init__(self, measurement: Measurement) -> None:
         self._measurement = measurement
 
     def registers(self, address: int, count: int) -> Sequence[int]:
-        """What stands there."""
+        """Return registers of measurement, clock and firmware version."""
         raw, strength, stamp_ms = self._measurement.newest()
         words = (raw, strength, 0, stamp_ms >> 16, stamp_ms & 0xFFFF, 0, *FIRMWARE)
         if address + count > len(words):
@@ -73,13 +73,13 @@ class TfminiITable(RegistersOnly):
         return words[address : address + count]
 
     def write_registers(self, address: int, values: Sequence[int]) -> None:
-        """Save, restart, baud rate, unit, rate."""
+        """Accept save, restart, baud rate, unit and rate without effect."""
         if not ADDRESS_SAVE <= address <= ADDRESS_LAST_SETTING:
             raise no_such(address, *values)
 
 
 class CanTfminiEmulator(WireEmulator):
-    """The sensor on a CAN bus behind an slcan adapter."""
+    """Running emulator of the sensor on a CAN bus behind an slcan adapter."""
 
     def __init__(self, measurement: Measurement, options: TfminiIOptions) -> None:
         super().__init__(PtyPort("slcan"), options, name="tfmini_can")
@@ -90,11 +90,11 @@ class CanTfminiEmulator(WireEmulator):
 
     @property
     def address(self) -> dict[str, Any]:
-        """`{"channel": PATH}`"""
+        """Return `{"channel": PATH}`."""
         return {"channel": super().address["port"]}
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """Adapter commands: open and close the channel."""
+        """Carry out the adapter's commands to open and close the channel."""
         for line in data.split(b"\r"):
             if line[:1] in (b"O", b"C"):
                 self.is_open = line[:1] == b"O"
@@ -102,12 +102,12 @@ class CanTfminiEmulator(WireEmulator):
                 self.reply(peer, b"\r")
 
     def on_tick(self) -> None:
-        """One measurement."""
+        """Send one measurement while the channel is open."""
         if self.is_open:
             self.send(None, self._frame(*self._measurement.newest()), protected=slice(0, 0))
 
     def status_frame(self) -> bytes | None:
-        """Too weak a signal."""
+        """Return a frame with too weak a signal."""
         return self._frame(0, WEAK, self._measurement.newest()[2])
 
     def _frame(self, raw: int, strength: int, stamp_ms: int) -> bytes:
@@ -122,7 +122,7 @@ def _measurement(backing: Device, options: dict[str, Any]) -> tuple[Measurement,
 
 
 def start_modbus(backing: Device, options: dict[str, Any]) -> ModbusFarSide:
-    """Entry point `tfmini_modbus`."""
+    """Start the Modbus emulator on a proximity device (entry point `tfmini_modbus`)."""
     measurement, parsed = _measurement(backing, options)
     emulator = ModbusFarSide(PtyPort("tfmini"), parsed, TfminiITable(measurement), unit=UNIT, name="tfmini_modbus")
     emulator.begin()
@@ -130,7 +130,7 @@ def start_modbus(backing: Device, options: dict[str, Any]) -> ModbusFarSide:
 
 
 def start_can(backing: Device, options: dict[str, Any]) -> CanTfminiEmulator:
-    """Entry point `tfmini_can`."""
+    """Start the CAN emulator on a proximity device (entry point `tfmini_can`)."""
     measurement, parsed = _measurement(backing, options)
     emulator = CanTfminiEmulator(measurement, parsed)
     emulator.begin()

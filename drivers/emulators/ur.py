@@ -1,7 +1,7 @@
-"""A Universal Robots controller on three TCP ports, moving an arm of any backend: RTDE, scripts, dashboard.
+"""Emulated Universal Robots controller on three TCP ports (RTDE, script, dashboard) that moves any arm.
 
-Of URScript it understands what a host sends: a program that servos to RTDE registers and ends with its heartbeat, and
-`stopj`.
+It understands only the URScript that the driver sends: `stopj`, and a program that servos to the joint positions in RTDE
+registers and ends when the heartbeat register no longer changes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SILENT_CYCLES = re.compile(r"while silent < (\d+):")
 CYCLE_S = 0.002
 
 
-PortNumber = Annotated[int, Field(ge=0, le=65535)]  # 0: a free one; a controller's own are 30004, 30002, 29999
+PortNumber = Annotated[int, Field(ge=0, le=65535)]  # 0: any free port; a real controller uses 30004, 30002, 29999
 
 
 class UrEmulatorOptions(FaultOptions):
@@ -61,7 +61,7 @@ class UrEmulatorOptions(FaultOptions):
 
 
 class UrPorts:
-    """RTDE, script and dashboard ports; a peer is `(role, connection)`."""
+    """The RTDE, script and dashboard ports as one port; a peer is `(role, connection)`."""
 
     def __init__(self, options: UrEmulatorOptions) -> None:
         numbers = {"rtde": options.rtde_port, "script": options.script_port, "dashboard": options.dashboard_port}
@@ -69,42 +69,42 @@ class UrPorts:
 
     @property
     def address(self) -> dict[str, Any]:
-        """Host and the three ports."""
+        """Return the driver options: host, RTDE port and script port."""
         numbers = {role: port.address["port"] for role, port in self._ports.items()}
         return {"host": "127.0.0.1", "port": numbers["rtde"], "script_port": numbers["script"]}
 
     @property
     def dashboard_port(self) -> int:
-        """Where the dashboard listens."""
+        """Return the port number of the dashboard."""
         return int(self._ports["dashboard"].address["port"])
 
     def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
-        """From all three; only the first waits."""
+        """Return what the three ports have received; only the RTDE port waits."""
         waits = {"rtde": timeout_s, "script": 0.0, "dashboard": 0.0}
         return [((role, sock), data) for role, port in self._ports.items() for sock, data in port.receive(waits[role])]
 
     def send(self, peer: Peer, data: bytes) -> None:
-        """To one connection; None means every RTDE client."""
+        """Send to one connection, or to every RTDE client if `peer` is None."""
         role, sock = ("rtde", None) if peer is None else peer
         self._ports[role].send(sock, data)
 
     def vanish(self) -> None:
-        """All three."""
+        """Unplug all three ports."""
         for port in self._ports.values():
             port.vanish()
 
     def appear(self) -> None:
-        """All three, on the same numbers."""
+        """Plug all three ports in again, with the same numbers."""
         for port in self._ports.values():
             port.appear()
 
     def close(self) -> None:
-        """All three, for good."""
+        """Close all three ports for good."""
         self.vanish()
 
 
 class UrEmulator(WireEmulator):
-    """The controller, running."""
+    """Running emulator of the controller."""
 
     def __init__(self, backing: Arm, options: UrEmulatorOptions) -> None:
         self.ports = UrPorts(options)
@@ -118,7 +118,7 @@ class UrEmulator(WireEmulator):
         self._inputs: dict[Peer, rtde.Recipe] = {}
         self._streams: set[Peer] = set()
         self._registers = [0] * 48
-        self._program: list[int] = []  # heartbeat register, then one a joint
+        self._program: list[int] = []  # register of the heartbeat, then one register per joint
         self._beat: int | None = None
         self._beat_s = self._device_s = 0.0
         self._watchdog_s = math.inf
@@ -126,16 +126,16 @@ class UrEmulator(WireEmulator):
 
     @property
     def address(self) -> dict[str, Any]:
-        """Ports and kinematics."""
+        """Return the driver options: host, ports and kinematics."""
         return {**super().address, "kinematics": kinematics_of(self._backing.capabilities())}
 
     def protective_stop(self) -> None:
-        """As a collision would: the arm brakes and the program ends."""
+        """Act as after a collision: stop the arm and end the program."""
         self.safety_mode = PROTECTIVE_STOP
         self._end_program()
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """By port."""
+        """Handle RTDE packages, scripts or dashboard commands, depending on the peer's port."""
         role, _ = peer
         if role == "rtde":
             if not data:
@@ -208,7 +208,7 @@ class UrEmulator(WireEmulator):
                 self._end_program()
 
     def _start_program(self, registers: list[int]) -> None:
-        """The first register read is the heartbeat; the joints are those after its last repetition."""
+        """Start a program that reads `registers`: the first is the heartbeat, the others are the joints in order."""
         joints = [number for number in registers if number != registers[0]] if registers else []
         if len(joints) != len(self._backing.capabilities().links) or self.safety_mode != NORMAL:
             return
@@ -242,7 +242,7 @@ class UrEmulator(WireEmulator):
                 return f"could not understand: '{line}'"
 
     def on_tick(self) -> None:
-        """The watchdog of the program, then one data package to each client."""
+        """Check the program's watchdog, then send one data package to each client."""
         sample = self._backing.read_state(deadline=self.deadline())
         self._device_s = time_of(sample)
         if self.runtime == PLAYING and self._device_s - self._beat_s > self._watchdog_s:
@@ -252,7 +252,7 @@ class UrEmulator(WireEmulator):
             self.send(peer, self._data(peer, values), protected=slice(0, 3))
 
     def status_frame(self) -> bytes | None:
-        """A package that says: protective stop."""
+        """Return a data package that reports a protective stop."""
         peer = next(iter(self._streams))
         state = self._backing.read_state(deadline=self.deadline()).value
         return self._data(peer, {**self._values(state), "safety_mode": [PROTECTIVE_STOP]})
@@ -276,7 +276,7 @@ class UrEmulator(WireEmulator):
 
 
 def start(backing: Device, options: dict[str, Any]) -> UrEmulator:
-    """Entry point `ur`."""
+    """Start the emulator on an arm (entry point `ur`)."""
     if not isinstance(backing, Arm):
         raise Unsupported(f"a robot arm cannot stand for a {backing.kind}", hint="back it with an arm")
     emulator = UrEmulator(backing, validate(options, UrEmulatorOptions, source="emulators.ur"))

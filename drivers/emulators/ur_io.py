@@ -1,4 +1,4 @@
-"""The digital inputs and outputs of a UR controller on loopback RTDE, worked by lights or touch pads of any kind."""
+"""Emulated digital inputs and outputs of a UR controller on loopback RTDE, backed by any lights or touch pads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FIRST_TOOL_INPUT = 16
 
 
 class UrIoEmulator(WireEmulator):
-    """The controller, running."""
+    """Running emulator of the controller."""
 
     def __init__(self, backing: Lights | Touch, options: FaultOptions) -> None:
         super().__init__(TcpPort(), options, name="ur_io")
@@ -39,7 +39,7 @@ class UrIoEmulator(WireEmulator):
         self.outputs = 0
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
-        """RTDE packages."""
+        """Answer the RTDE packages."""
         if not data:
             self._parsers[peer] = rtde.PackageParser()
             self._streams.discard(peer)
@@ -71,12 +71,12 @@ class UrIoEmulator(WireEmulator):
             self._backing.set_on(lit, deadline=self.deadline())
 
     def on_tick(self) -> None:
-        """One package to each client."""
+        """Send one data package to each client."""
         for peer in list(self._streams):
             self.send(peer, self._package(peer), protected=slice(0, 3))
 
     def status_frame(self) -> bytes | None:
-        """A text for people, which may come at any time."""
+        """Return a text message, which a controller may send at any time."""
         return rtde.package("M", struct.pack(">B5sB3s", 5, b"joint", 3, b"rtc") + b"\x00")
 
     def _package(self, peer: Peer) -> bytes:
@@ -97,7 +97,7 @@ class UrIoEmulator(WireEmulator):
 
 
 def start(backing: Device, options: dict[str, Any]) -> UrIoEmulator:
-    """Entry point `ur_io`."""
+    """Start the emulator on lights or touch pads (entry point `ur_io`)."""
     if not isinstance(backing, Lights | Touch):
         raise Unsupported(f"digital points cannot stand for a {backing.kind}", hint="back them with lights or touch")
     emulator = UrIoEmulator(backing, validate(options, FaultOptions, source="emulators.ur_io"))

@@ -1,7 +1,7 @@
-"""A new driver that runs from its first minute: driver, far side, test and page, to be changed as the manual says.
+"""Generates a new driver that runs at once: driver, emulator, test and documentation page, to be adapted to the device.
 
-The made-up device streams frames `A5 5A counter values.. sum`, values in thousandths of the SI unit. `panelwright new-driver`
-finds this by the entry point `panelwright.scaffold`.
+The generated driver is for an invented device that streams frames `A5 5A counter values.. sum`, with values in thousandths
+of the SI unit. `panelwright new-driver` finds this module by the entry point `panelwright.scaffold`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ WIRES: dict[str, dict[str, str]] = {
 def new_driver(
     name: str, kind: DeviceKind, *, transport: Transport = "serial", package: str | None = None
 ) -> dict[Path, str]:
-    """Paths and texts of a driver, its emulator, its test and its page; write them where you like.
+    """Return the texts of a driver, its emulator, its test and its page by their relative paths; nothing is written.
 
     Args:
-        name: module name, small letters, digits and underscores.
-        package: of its own, with the emulator beside the driver and a `pyproject.toml`; None for a place in this tree.
+        name: module name: lower-case letters, digits and underscores.
+        package: name of a separate package, with the emulator beside the driver and a `pyproject.toml`; None for files in
+            this source tree.
 
     Raises:
-        ConfigError: no such name, kind or transport is possible.
+        ConfigError: the name is not valid, or there is no template for the kind or the transport.
     """
     for word in (name, package or name):
         if not NAME.fullmatch(word):
@@ -66,7 +67,7 @@ def new_driver(
 
 
 def entry_points(name: str, transport: Transport) -> dict[str, str]:
-    """Lines that register a driver of this tree, by the header of their table in `pyproject.toml`."""
+    """Return the lines that register a driver of this source tree, by the header of their table in `pyproject.toml`."""
     return {
         '[project.entry-points."panelwright.devices"]': f'"{transport}:{name}" = "drivers.{name}:connect"',
         '[project.entry-points."panelwright.emulators"]': f'{name} = "drivers.emulators.{name}:start"',
@@ -114,7 +115,7 @@ def _words(name: str, kind: DeviceKind, transport: Transport, package: str | Non
 
 
 def _imports(k: KindText, wire: Mapping[str, str], driver: str, far_side: str) -> dict[str, str]:
-    """The import blocks of driver, far side and test."""
+    """Return the import blocks of driver, emulator and test."""
     own: Imports = {
         "struct": (),
         "typing": ("Any",),
@@ -150,7 +151,7 @@ def _imports(k: KindText, wire: Mapping[str, str], driver: str, far_side: str) -
     }
     others = (
         () if driver.startswith("drivers.") else (driver.partition(".")[0],)
-    )  # beside a package its tests are strangers
+    )  # in a separate package the tests import the driver as third-party code
     return {
         "imports": import_lines([own, k.imports]),
         "far_imports": import_lines([far, far_extra]),
@@ -159,7 +160,7 @@ def _imports(k: KindText, wire: Mapping[str, str], driver: str, far_side: str) -
 
 
 def import_lines(parts: Iterable[Imports], others: Sequence[str] = ()) -> str:
-    """Import statements in the order that ruff's isort gives them: standard library, others, ours."""
+    """Return import statements in the order of ruff's isort: standard library, third party, this project."""
     names: dict[str, set[str]] = {}
     for part in parts:
         for module, wanted in part.items():

@@ -1,4 +1,4 @@
-"""What differs from kind to kind in a new driver's texts."""
+"""The parts of a generated driver that depend on the device kind."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass, field
 from hal.devices import DeviceKind
 
 Imports = dict[str, tuple[str, ...]]
-"""Module to the names taken from it; none for the module itself."""
+"""Names imported from each module; no names means that the module itself is imported."""
 
 NUMPY: Imports = {"numpy": ()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KindText:
-    """Pieces of source.
+    """Pieces of source code for one device kind.
 
     Attributes:
-        base: class that the driver inherits; `publish` is what it calls with a value.
+        base: class that the driver inherits; `publish` is the method that it calls with a value.
         members: class attributes; `methods`: capabilities, reads and commands.
-        count: numbers in a frame, each of the `struct` code `code`, in thousandths of the SI unit.
-        decode: `numbers` to a value; `encode`: `sample.value` to numbers.
-        far_methods: what the emulator does with commands.
-        imports, far_imports: what these pieces need, in the driver and in its far side.
-        stand_in: scripted device behind the far side in the tests.
+        count: how many numbers a frame holds, each of the `struct` code `code`, in thousandths of the SI unit.
+        decode: converts `numbers` to a value; `encode`: converts `sample.value` to numbers.
+        far_methods: the emulator's methods that handle commands.
+        imports, far_imports: imports that these pieces need, in the driver and in its emulator.
+        stand_in: scripted device that backs the emulator in the tests.
     """
 
     protocol: str

@@ -1,4 +1,4 @@
-"""Texts of a new driver: driver, far side, conformance test, page. `$words` are filled in by `drivers.scaffold`."""
+"""Templates of a new driver: driver, emulator, conformance test, page; `drivers.scaffold` fills in the `$words`."""
 
 from __future__ import annotations
 

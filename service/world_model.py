@@ -1,4 +1,4 @@
-"""What the cell has found out so far: where the panel stands, what its objects last showed, and what each sensor last sent.
+"""The facts that the cell has measured so far: the panel's pose, and the newest readings and frames.
 
 The facts are one frozen value that is replaced as a whole under a lock, so that a reader in another thread never sees
 half of a change.
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Facts:
-    """Everything that is known of one panel before one cell.
+    """Everything that is known about the cell and the panel in front of it.
 
     Attributes:
-        base_from_panel: pose of the panel with covariance; None until the panel was located.
-        readings: newest answered reading of each object, by the object's name.
+        base_from_panel: pose of the panel with covariance; None until the panel has been located.
+        readings: newest conclusive reading of each object, by the object's name.
         frames: newest frame of each camera and range scanner, by the device's name.
-        kinematics: of the cell's arm; None until it was first needed.
+        kinematics: of the cell's arm; None until first needed.
     """
 
     base_from_panel: UncertainPose | None = None
@@ -49,29 +49,29 @@ class WorldModel:
 
     @property
     def base_from_panel(self) -> UncertainPose | None:
-        """Where the panel is believed to stand, with covariance; None until it was located."""
+        """Estimated pose of the panel, with covariance; None until it has been located."""
         return self._facts.base_from_panel
 
     @property
     def readings(self) -> Mapping[str, ObjectReading]:
-        """The newest answered reading of each object, by name."""
+        """The newest conclusive reading of each object, by name."""
         return self._facts.readings
 
     def believe_panel(self, base_from_panel: UncertainPose) -> None:
-        """Take `base_from_panel` for the panel's pose from now on."""
+        """Store `base_from_panel` as the estimated pose of the panel."""
         self._change(lambda facts: replace(facts, base_from_panel=base_from_panel))
 
     def forget_panel(self) -> None:
-        """Drop the panel's pose, because what it was measured with has changed."""
+        """Drop the panel's pose, because the calibration that it was measured with has changed."""
         self._change(lambda facts: replace(facts, base_from_panel=None))
 
     def note_readings(self, readings: Iterable[ObjectReading]) -> None:
-        """Keep the readings that were answered in place of earlier ones of the same objects."""
+        """Store the conclusive readings in place of earlier ones of the same objects."""
         answered = {reading.name: reading for reading in readings if reading.answered}
         self._change(lambda facts: replace(facts, readings=MappingProxyType({**facts.readings, **answered})))
 
     def forget_reading(self, name: str) -> None:
-        """Drop the reading of an object that is being worked: what it showed before does not predict what it shows now."""
+        """Drop the reading of an object, because its state may have changed or the reading is in doubt."""
         self._change(
             lambda facts: replace(
                 facts, readings=MappingProxyType({known: r for known, r in facts.readings.items() if known != name})
@@ -79,12 +79,12 @@ class WorldModel:
         )
 
     def note_frame(self, device: str, frame: Frame) -> Frame | None:
-        """Keep the newest frame of a sensor; returns the one before."""
+        """Store the newest frame of a sensor; returns the previous one."""
         before = self._change(lambda facts: replace(facts, frames=MappingProxyType({**facts.frames, device: frame})))
         return before.frames.get(device)
 
     def kinematics(self, make: Callable[[], Kinematics]) -> Kinematics:
-        """The arm's kinematics, made once."""
+        """Return the arm's kinematics, which are built once."""
         known = self._facts.kinematics
         if known is None:
             known = make()
@@ -92,11 +92,11 @@ class WorldModel:
         return known
 
     def forget(self) -> None:
-        """Drop everything: another panel may stand before the cell, and another arm may move."""
+        """Drop all facts, because the panel or the arm may have been exchanged."""
         self._change(lambda _facts: Facts())
 
     def _change(self, change: Callable[[Facts], Facts]) -> Facts:
-        """Replace the facts by what `change` makes of them; returns those before."""
+        """Replace the facts by the result of `change`; returns the previous facts."""
         with self._lock:
             before = self._facts
             self._facts = change(before)
@@ -104,7 +104,7 @@ class WorldModel:
 
 
 def expected_panel(cell: Cell) -> UncertainPose:
-    """`base_from_panel` as the cell file has it; its tolerances count as three standard deviations."""
+    """Return `base_from_panel` from the cell file, whose tolerances count as three standard deviations."""
     w = cell.file.workspace
     sigma = np.repeat([w.position_tolerance_m / 3.0, w.angle_tolerance_rad / 3.0], 3)
     pose = transform_rpy(w.panel_position_m, w.panel_rpy_rad)

@@ -1,4 +1,4 @@
-"""The verbs of the cell, by name."""
+"""The operations (verbs) of the cell, by name."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ __all__ = ["OPERATIONS", "Operation", "OperationContext"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Operation:
-    """A verb of the API.
+    """An operation that the API offers as a verb.
 
     Attributes:
         name: path of the verb, e.g. `panel-pose`.
         request_model: strict model of the body.
-        result_model: what a task of this verb ends with.
-        run: does the work in a worker thread; returns a `result_model`; raises `CellError`.
+        result_model: model of the result of a task of this verb.
+        run: does the work in a worker thread; returns a `result_model` or raises `CellError`.
         summary: one line for the API document.
         example: a body that works on the shipped cell.
         moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
-        is_still: tells of requests for which it does not, although it may.
-        check: raises `InvalidRequest` for a request that makes no sense in this cell, before there is a task.
+        is_still: returns whether a given request moves nothing although the verb may move the arm.
+        check: raises `InvalidRequest`, before a task is created, for a request that is not possible in this cell.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Operation:
     check: Callable[[Cell, Any], None] = field(default=lambda _cell, _request: None)
 
     def may_move(self, request: BaseModel) -> bool:
-        """May the arm move for this request?"""
+        """Return whether the arm may move for this request."""
         return self.moves and not self.is_still(request)
 
 
@@ -58,7 +58,10 @@ MEASUREMENT_EXAMPLE = {
 
 
 def _in_session(module: str, function: str) -> Callable[[OperationContext, Any], results.Result]:
-    """`service.operations.<module>.<function>(session, request)`, imported when first used: the service is up fast."""
+    """Return a function that runs `service.operations.<module>.<function>(session, request)`.
+
+    The module is imported at the first call, so that the service starts fast.
+    """
 
     def run(context: OperationContext, request: Any) -> results.Result:
         from importlib import import_module
@@ -71,7 +74,7 @@ def _in_session(module: str, function: str) -> Callable[[OperationContext, Any],
 
 
 def _checked_by(function: str) -> Callable[[Cell, Any], None]:
-    """`service.operations.manipulate.<function>(cell, request)`, imported when first used, as in `_in_session`."""
+    """Return a check by `service.operations.manipulate.<function>(cell, request)`, imported at the first call."""
 
     def check(cell: Cell, request: Any) -> None:
         from service.operations import manipulate

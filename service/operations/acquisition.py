@@ -1,6 +1,6 @@
-"""Images and range scans of now, together with where the sensor stood.
+"""Acquires images and range scans together with the pose of the sensor.
 
-A line scanner is swept by the wrist: its lines become the depth image that a range camera would have taken.
+A line scanner is swept by the wrist, and its lines become the depth image that a range camera would have taken.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from service.operations.session import Session
 from service.operations.travel import kinematics, skill_context
 
 READ_S = 5.0  # wall seconds for one device call; a software renderer on a busy machine takes up to 0.5 s
-OLDEST_S = 0.2  # before the call: a frame must be of the present, however long it takes to arrive
-SETTLE_S = 0.06  # lamps and arm come to rest
+OLDEST_S = 0.2  # a frame may have been taken this long before the call; its time of arrival does not matter
+SETTLE_S = 0.06  # time in which lamps and arm come to rest
 SWEPT_RAD = 0.96  # angle that the lines of a sweep are spread over
-LEAST_LINES, MOST_LINES = 96, 160  # of a swept image; a scanner with coarse steps is swept more finely than it looks
+LEAST_LINES, MOST_LINES = 96, 160  # of a swept image; the lines may be closer to each other than the beams of a line
 LONGEST_SWEEP_S = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Look:
-    """One image: uint8 pixels, (H, W) or (H, W, 3), and where the camera stood."""
+    """One image, uint8 (H, W) or (H, W, 3), and the pose of the camera."""
 
     pixels: NDArray[np.uint8]
     stamp_s: float
@@ -47,7 +47,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LightPair:
-    """The same view with the border lights off and on."""
+    """Two images from the same pose, with the border lights off and on."""
 
     off: Look
     on: Look
@@ -55,7 +55,7 @@ class LightPair:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scan:
-    """One range image (float32 metres, NaN where nothing) and where the scanner stood."""
+    """One range image (float32 metres, NaN where nothing was measured) and the pose of the scanner."""
 
     depth_m: NDArray[np.float32]
     stamp_s: float
@@ -66,10 +66,10 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SweptImage:
-    """What a sweep gave.
+    """The result of a sweep.
 
     Attributes:
-        depth_m: (H, W), NaN where nothing was seen, as from a range camera in the pose before the sweep.
+        depth_m: (H, W) as from a range camera in the pose before the sweep; NaN where nothing was measured.
         capabilities: of that camera.
         newest: the last scan.
     """
@@ -80,7 +80,7 @@ class SweptImage:
 
 
 def only_device(session: Session, kind: DeviceKind, name: str | None = None) -> tuple[str, Any]:
-    """The device of a kind: the named one, or the first in the cell file.
+    """Return name and device of a kind: the named device, or the first one in the cell file.
 
     Raises:
         ConfigError: the cell has none.
@@ -93,17 +93,17 @@ def only_device(session: Session, kind: DeviceKind, name: str | None = None) -> 
 
 
 def deadline(duration_s: float = READ_S) -> Deadline:
-    """A deadline for one device call of this process."""
+    """Return a deadline for one device call, on the wall clock of this process."""
     return Deadline.after(WallClock(), duration_s)
 
 
 def settle(session: Session, duration_s: float = SETTLE_S) -> None:
-    """Stand still until lamps and arm are at rest."""
+    """Hold the arm still until lamps and arm are at rest."""
     session.run(Hold(name="settle", duration_s=duration_s), expect=(MotionOutcome.COMPLETED,))
 
 
 def look(session: Session, camera: str | None = None) -> Look:
-    """One image from where the arm stands now; the arm must be at rest.
+    """Return one image from the present pose of the arm, which must be at rest.
 
     Raises:
         StaleReading: the camera repeats an old frame.
@@ -124,7 +124,7 @@ def look(session: Session, camera: str | None = None) -> Look:
 
 
 def look_with_lights(session: Session) -> LightPair:
-    """The panel with its border lights off, then on; they are off again afterwards."""
+    """Return an image with the border lights off and one with them on; they are switched off again afterwards."""
     name, lights = only_device(session, DeviceKind.LIGHTS)
     channels = len(lights.capabilities().channels)
     wait_s = max(SETTLE_S, lights.capabilities().settle_s)
@@ -139,7 +139,7 @@ def look_with_lights(session: Session) -> LightPair:
 
 
 def scan(session: Session) -> Scan:
-    """One range image from where the arm stands now; the arm must be at rest. A line scanner is swept for it."""
+    """Return one range image from the present pose of the arm, which must be at rest; a line scanner is swept."""
     name, device = only_device(session, DeviceKind.RANGE_SCANNER)
     capabilities = device.capabilities()
     if capabilities.needs_sweep:
@@ -166,7 +166,7 @@ def scan(session: Session) -> Scan:
 
 
 def base_from(session: Session, device: str) -> UncertainPose:
-    """Where a mounted device stands now, with the covariance of its calibration."""
+    """Return the present pose of a mounted device, with the covariance of its calibration."""
     cell: Cell = session.connection.cell
     return frame_tree(cell, session.connection.mover.state().base_from_flange).base_from(device)
 
@@ -184,7 +184,7 @@ def _switch(session: Session, name: str, lights: Any, on: tuple[bool, ...], wait
 
 
 def _refuse_frozen(session: Session, name: str, sample: Stamped[Any], array: NDArray[Any]) -> None:
-    """Raise `StaleReading` where a camera or scanner repeats a frame under a new stamp."""
+    """Raise `StaleReading` if a camera or scanner repeats a frame under a new time stamp."""
     newest = plausibility.Frame.of(array, stamp_s=sample.host_time_s)
     finding = plausibility.repeated_frame(name, session.world.note_frame(name, newest), newest)
     if finding is not None:
@@ -195,7 +195,7 @@ def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
     """Sweep the line scanner `name` about the pose in which the arm stands, and return to it.
 
     Raises:
-        Unsupported: its driver keeps no scans.
+        Unsupported: its driver cannot record scans.
         Unreachable: the wrist has no room to sweep.
         NotFound: no scan came during the sweep.
     """
@@ -246,13 +246,13 @@ def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
 
 
 def sweep_rate_rad_per_s(c: RangeScannerCapabilities) -> float:
-    """How fast the wrist turns: one step of the beams per line, within a sensible number of lines and time."""
+    """Return the speed of the wrist: one angular step of the beams per line, within limits on lines and duration."""
     line_rad = np.clip(abs(c.step_angle_rad), SWEPT_RAD / MOST_LINES, SWEPT_RAD / LEAST_LINES)
     return float(max(line_rad * c.rate_hz, SWEPT_RAD / LONGEST_SWEEP_S))
 
 
 def _refuse_frozen_lines(name: str, scans: Sequence[Stamped[RangeImage]]) -> None:
-    """Two lines of a live scanner are never equal to the last bit, least of all while it turns."""
+    """Raise `StaleReading` if all lines are equal to the last bit, which the noise of a working scanner rules out."""
     lines = {np.nan_to_num(scan.value.depth_m).tobytes() for scan in scans if np.isfinite(scan.value.depth_m).any()}
     if len(scans) > 1 and len(lines) == 1:
         raise StaleReading(

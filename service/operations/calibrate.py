@@ -1,4 +1,4 @@
-"""The verb `calibrations`: the arm drives through stations that tell most, measures, and keeps a dated record."""
+"""The verb `calibrations`: measures from the most informative stations and stores a dated calibration record."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ KINDS = {
 
 
 def run_calibrations(session: Session, request: CalibrationRequest) -> CalibrationResult:
-    """Measure, solve, keep the record. Nothing is written unless the result is good enough."""
+    """Measure, solve and store the record. Nothing is written unless the result is accurate enough."""
     device = _device(session, request)
     if request.dry_run:
         stations = _planned(session, request, device)
@@ -48,7 +48,7 @@ def run_calibrations(session: Session, request: CalibrationRequest) -> Calibrati
     record = renewed(current, record_of(device, found, date=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())))
     path = Calibrations.of_runs(session.context.runs_dir, session.cell).write(record)
     if request.what != "tool":
-        session.world.forget_panel()  # it was seen through the mount of before
+        session.world.forget_panel()  # its pose was measured through the previous mount
     session.progress(0.97, "back to the parking place")
     park(session)
     return CalibrationResult(
@@ -64,7 +64,7 @@ def run_calibrations(session: Session, request: CalibrationRequest) -> Calibrati
 
 
 def _device(session: Session, request: CalibrationRequest) -> str:
-    """The device that is meant; it must sit on the flange."""
+    """Return the name of the device to calibrate, which must be mounted on the flange."""
     names = session.cell.names_of(KINDS[request.what])
     if request.device is not None and request.device not in names:
         raise InvalidRequest(
@@ -97,7 +97,7 @@ def _measure(
 
 
 def _planned(session: Session, request: CalibrationRequest, device: str) -> list[StationResult]:
-    """The stations that would be tried first, as flange poses, from what is believed of the panel now."""
+    """Return the stations that would be tried first, as flange poses, for the present estimate of the panel's pose."""
     if request.what == "tool":
         arm = kinematics(session)
         return [
@@ -113,7 +113,7 @@ def _planned(session: Session, request: CalibrationRequest, device: str) -> list
 
 
 def _pictures(session: Session, found: InHandCalibration | ScannerCalibration | WrenchCalibration) -> list[str]:
-    """Draw the camera's stations and what the lights miss the fit by; the others leave no picture."""
+    """Draw the stations and the residuals of a camera calibration; other calibrations have no picture."""
     if not isinstance(found, InHandCalibration):
         return []
     size_m = (session.panel.width_m, session.panel.height_m)
@@ -122,7 +122,7 @@ def _pictures(session: Session, found: InHandCalibration | ScannerCalibration | 
 
 
 def _change(before: CalibrationRecord, after: CalibrationRecord) -> CalibrationChange:
-    """How far the new record is from the one before."""
+    """Return the differences between the new record and the previous one."""
     moved = focal_px = mass_kg = None
     if before.mount is not None and after.mount is not None:
         moved = difference(after.mount.pose().parent_from_child, before.mount.pose().parent_from_child)

@@ -1,4 +1,4 @@
-"""Calibrating one sensor of the hand: its stations, what is measured at each, and the solution."""
+"""Calibrates one sensor of the hand: chooses its stations, measures at each of them, and solves."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from service.operations.locate import lights_in, scan_plate
 from service.operations.session import Session
 from service.operations.travel import go_to_first, go_to_joints, kinematics, reachable
 
-MOST_SCATTER = 9.0  # chi-square a degree: three times the stated noise is no noise any more
-LEAST_LENS = (1e-5, 0.01, 1e-5)  # a record without sigmas does not mean a lens without error
+MOST_SCATTER = 9.0  # chi-square per degree of freedom, that is, residuals of three times the stated noise
+LEAST_LENS = (1e-5, 0.01, 1e-5)  # lower limits of the sigmas, because a record without sigmas does not mean no error
 SCANNER_DISTANCE_M = 0.42
 SCANNER_STEPS = (1.0, 1.35)
 POINTS_A_SCAN = 400
 WRENCH_SAMPLES = 40
 WRENCH_STEP_S = 0.01
-WEIGH_REST_S = 0.3  # the hand swings a little after a motion
-REST_S = 0.2  # servos trail by tens of milliseconds
+WEIGH_REST_S = 0.3  # time in which the hand stops swinging after a motion
+REST_S = 0.2  # longer than the lag of the servos, which is tens of milliseconds
 
 T = TypeVar("T")
 
@@ -52,7 +52,7 @@ T = TypeVar("T")
 
 
 def camera_stations(session: Session, camera: str, count: int, known: Beforehand) -> list[RigidTransform]:
-    """Flange poses from which all four lights are in view; the `count` that together tell most come first."""
+    """Return flange poses with all four lights in view; the `count` that are most informative together come first."""
     start, points_m = _nominal(session, camera), _lights_m(session)
     x, z, lens = start.flange_from_camera, start.base_from_target, start.intrinsics
     nearest_m = viewpoints.overview_distance_m(session.panel, lens, 0.0)
@@ -67,7 +67,8 @@ def measure_camera(session: Session, camera: str, count: int, known: Beforehand)
     """Drive through the stations, look with the lights off and on, and solve for mount, panel and lens.
 
     Raises:
-        Unreachable: too few stations; NotObservable: they leave the mount too uncertain, or scatter too much.
+        Unreachable: there are too few stations.
+        NotObservable: the mount remains too uncertain, or the measurements scatter too much.
     """
     session.progress(0.08, "choose the stations that tell most")
     flanges = camera_stations(session, camera, count, known)
@@ -102,7 +103,7 @@ def _lights_m(session: Session) -> Array:
 
 
 def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforehand:
-    """What is known of the lens by its record or by nobody, of the lights, and of the arm."""
+    """Return the prior uncertainties of lens, lights and arm; a lens counts as unknown unless `is_lens_known`."""
     arm = session.connection.device(session.first(DeviceKind.ARM)).capabilities()
     known, lens = UNKNOWN_LENS, session.cell.calibration_of(camera).intrinsics
     if is_lens_known and lens is not None:
@@ -118,7 +119,7 @@ def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforeh
 
 
 def scanner_stations(session: Session, scanner: str, count: int) -> list[RigidTransform]:
-    """Flange poses that look at the plate; the `count` that together tell most come first."""
+    """Return flange poses that look at the plate; the `count` that are most informative together come first."""
     x, z = session.mount(scanner).parent_from_child, session.believed_panel().parent_from_child
     candidates = calibration_poses.around(
         z, x, SCANNER_DISTANCE_M, steps=SCANNER_STEPS, cone_rad=calibration_poses.PLATE_CONE_RAD
@@ -129,8 +130,7 @@ def scanner_stations(session: Session, scanner: str, count: int) -> list[RigidTr
 def measure_scanner(session: Session, scanner: str, count: int) -> ScannerCalibration:
     """Drive through the stations, scan the plate, and solve for the mount; the panel must be located.
 
-    Raises:
-        as `measure_camera`.
+    Errors as for `measure_camera`.
     """
     flanges = scanner_stations(session, scanner, count)
 
@@ -153,11 +153,11 @@ def measure_scanner(session: Session, scanner: str, count: int) -> ScannerCalibr
     return result
 
 
-# -- tool: weight and bias with the hand turned every way ---------------------------------------------------------------
+# -- tool: weight and bias with the hand turned into many directions ----------------------------------------------------
 
 
 def tool_joints(session: Session, sensor: str) -> list[Array]:
-    """Joint vectors about the parking place, those first that turn gravity furthest in sensor axes."""
+    """Return joint vectors about the parking position; those that turn gravity furthest in sensor axes come first."""
     arm = kinematics(session)
     turn = matrix_of(session.mount(sensor).parent_from_child)
     return calibration_poses.wrist_turns(
@@ -168,7 +168,7 @@ def tool_joints(session: Session, sensor: str) -> list[Array]:
 
 
 def measure_tool(session: Session, sensor: str, count: int) -> WrenchCalibration:
-    """Turn the hand every way, read the raw wrench at rest, and solve for weight, centre and bias.
+    """Turn the hand into many directions, read the raw wrench at rest, and solve for weight, centre and bias.
 
     Raises:
         NotObservable: gravity came from too few directions.
@@ -190,7 +190,7 @@ def measure_tool(session: Session, sensor: str, count: int) -> WrenchCalibration
 
 
 def _rest_wrench(session: Session, sensor: str) -> Array:
-    """(6,) mean raw reading with the hand at rest."""
+    """Return the mean raw wrench (6,) with the hand at rest."""
     device = session.connection.device(sensor)
     readings = []
     for _ in range(WRENCH_SAMPLES):
@@ -207,7 +207,7 @@ def _rest_wrench(session: Session, sensor: str) -> Array:
 def order(
     session: Session, candidates: Sequence[RigidTransform], propose: calibration_poses.Propose, *, count: int
 ) -> list[RigidTransform]:
-    """All candidates that the arm can stand in; the `count` that together tell most come first.
+    """Return all candidates that the arm can reach; the `count` that are most informative together come first.
 
     Raises:
         Unreachable: fewer than `count` are left.
@@ -227,10 +227,10 @@ def order(
 def visit(
     session: Session, flanges: Sequence[RigidTransform], measure: Callable[[], T], *, count: int, name: str
 ) -> list[T]:
-    """Drive to one station after the other and measure at each; those without a free way or without a sight are left out.
+    """Drive to one station after the other and measure at each; stations that cannot be reached or used are left out.
 
     Raises:
-        Unreachable: the stations are used up before `count` were measured from; says why the last one was not.
+        Unreachable: fewer than `count` stations could be used; the error says why the last one could not.
     """
     found: list[T] = []
     why = ""

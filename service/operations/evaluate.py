@@ -1,4 +1,4 @@
-"""Compares a finished report with what the simulator says really happened. Nothing else ever asks for the truth."""
+"""Compares a finished report with the true state of the simulator, which nothing else in the service reads."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ AFTER = "after the actions"
 
 
 def evaluate(connection: CellConnection, folder: Path) -> EvaluateResult:
-    """Add `judge` to the report in `folder` and draw it again; returns that part.
+    """Add the section `judge` to the report in `folder` and render it again; returns that section.
 
     Raises:
-        InvalidRequest: there is no such report, or another cell's simulator knows the truth of it.
-        Unsupported: the cell is not simulated, so nobody knows the truth.
+        InvalidRequest: there is no such report, or it belongs to the simulator of another cell.
+        Unsupported: the cell is not simulated, so the truth is not known.
     """
     if not (folder / "report.json").is_file():
         raise InvalidRequest(f"there is no report of a mission {folder.name!r}", hint="GET /v1/missions lists them")
@@ -42,7 +42,7 @@ def evaluate(connection: CellConnection, folder: Path) -> EvaluateResult:
                 f"mission {folder.name!r} was of {key} {report[key]!r}, this service runs {key} {value!r}",
                 hint="judge a mission in the service that ran it: the simulator of another one knows nothing of it",
             )
-    began_s = report.get("started_cell_s", -np.inf)  # reports of older versions do not say
+    began_s = report.get("started_cell_s", -np.inf)  # reports of older versions do not have this key
     verdict = compare(report, truth_of(connection, connection.clock.now_s() - began_s), connection.cell.panel)
     write_json(folder, {**report, "judge": jsonable(verdict)})
     render(folder)
@@ -50,7 +50,7 @@ def evaluate(connection: CellConnection, folder: Path) -> EvaluateResult:
 
 
 def truth_of(connection: CellConnection, ago_s: float) -> Truth:
-    """The truth of a simulated cell, its `initial` from `ago_s` before; ask only when the mission is over."""
+    """Return the true state of a simulated cell, with `initial` from `ago_s` before; only for finished missions."""
     arms = connection.devices_of(DeviceKind.ARM) | connection.behind_wires_of(DeviceKind.ARM)
     for arm in arms.values():
         if hasattr(arm, "truth"):
@@ -63,9 +63,9 @@ def truth_of(connection: CellConnection, ago_s: float) -> Truth:
 
 
 def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> EvaluateResult:
-    """Pose error, reading errors and what really moved, against a report's claims.
+    """Compare a report's pose, readings and actions with the truth.
 
-    The simulator tells how the mission ended: of several deeds with one control only the last can be judged.
+    The truth is known at the end of the mission, so of several actions on one control only the last is judged.
     """
     before = {panel_object.name: panel_object for panel_object in truth.initial}
     after = {panel_object.name: panel_object for panel_object in truth.objects}
@@ -96,7 +96,7 @@ def compare(report: dict[str, Any], truth: Truth, panel: Panel) -> EvaluateResul
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseError:
-    """How far the fused pose is from the truth: `delta` (6,) translation (m), then rotation (rad), and in sigmas squared."""
+    """Error of the fused pose: `delta` (6,) translation (m), then rotation (rad), and its square in sigmas."""
 
     delta: Array
     mahalanobis: float
@@ -123,14 +123,14 @@ def _reading_claim(reading: dict[str, Any], truth: ObjectTruth, panel: Panel) ->
 
 
 def shown_of(truth: ObjectTruth) -> Shown:
-    """The simulator's answer in the words of the panel file."""
+    """Return what an object truly shows, in the terms of the panel file."""
     return Shown(value=truth.value, state=truth.state, text=truth.text)
 
 
 def _action_claim(
     action: dict[str, Any], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth], panel: Panel
 ) -> ActionClaim:
-    """A confirmed action must be true; an unconfirmed one must not claim anything."""
+    """Judge an action: a confirmed one must have reached its target; an unconfirmed one claims nothing."""
     name = action["object"]
     spec = panel.object(name)
     reached = _reached(spec, action, after)
@@ -145,7 +145,7 @@ def _action_claim(
 
 
 def _is_outdated(k: int, readings: list[dict[str, Any]]) -> bool:
-    """Was the same object read again after a later deed?"""
+    """Return whether the same object was read again after a later action."""
     asked = (readings[k]["name"], AFTER)
     return readings[k]["when"] == AFTER and asked in [(later["name"], later["when"]) for later in readings[k + 1 :]]
 
@@ -153,7 +153,7 @@ def _is_outdated(k: int, readings: list[dict[str, Any]]) -> bool:
 def _moved_unasked(
     actions: list[dict[str, Any]], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth], panel: Panel
 ) -> list[UnaskedMotion]:
-    """What shows something else than before and was not worked, nor is lit by what was."""
+    """Return the objects that changed although neither they nor a control that they belong to was operated."""
     worked = {action["object"] for action in actions}
     worked |= {panel.object(name).shown_by for name in worked}
     return [
@@ -164,7 +164,7 @@ def _moved_unasked(
 
 
 def _reached(spec: PanelObject, action: dict[str, Any], after: dict[str, ObjectTruth]) -> bool:
-    """Whether what shows the deed truly shows its target."""
+    """Return whether the object that shows the result of the action truly shows its target."""
     return spec.goal is not None and spec.goal.is_reached(action["target"], shown_of(after[spec.shown_by]))
 
 

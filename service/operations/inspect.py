@@ -1,4 +1,4 @@
-"""Reading the panel: an overview to find the objects, close-ups to read them, and looks past what hides them."""
+"""Reads the panel: finds the objects in an overview, reads them in close-ups, and looks past what hides them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from service.schema.mission_results import ReadingResult
 from service.schema.requests import InspectRequest, RecogniseRequest
 from service.schema.results import InspectResult
 
-TIPS_M = 0.085  # of the finger tips before the plate in a look from the side: what hides an object hangs there
-MOST_UNREAD = 4  # more than these at once: the light or the lens, and no cable
+TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
+MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AnnotatedView:
-    """One look as people see it: an RGB image, uint8 (H, W, 3), with what was read drawn in."""
+    """One image for people: RGB, uint8 (H, W, 3), with the readings drawn in."""
 
     title: str
     pixels: NDArray[np.uint8]
@@ -40,7 +40,7 @@ class AnnotatedView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inspection:
-    """What one or several looks said, with a picture a look."""
+    """The readings from one or several images, with one picture per image."""
 
     readings: dict[str, ObjectReading]
     pictures: tuple[AnnotatedView, ...]
@@ -53,7 +53,7 @@ def inspect_here(
     *,
     title: str = "objects of the panel file in the image",
 ) -> Inspection:
-    """Read objects from where the camera is now."""
+    """Read objects from the present pose of the camera."""
     view = seen or look(session)
     camera_from_panel = compose(view.base_from_camera.inverse(), session.known_panel())
     try:
@@ -67,7 +67,7 @@ def inspect_here(
         )
     except PerceptionError:
         settle(session)
-        look(session, view.camera)  # a frozen camera shows the panel where it was: the second equal frame names it
+        look(session, view.camera)  # raises if the camera is frozen, which a second identical frame shows
         raise
     session.world.note_readings(readings)
     picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings))
@@ -75,12 +75,12 @@ def inspect_here(
 
 
 def inspect_close(session: Session, names: Collection[str]) -> Inspection:
-    """Read objects from close-ups, and what they do not tell from the sides."""
+    """Read objects from close-ups, and those that cannot be read there from the sides."""
     return look_past(session, close_ups(session, names))
 
 
 def close_ups(session: Session, names: Collection[str]) -> Inspection:
-    """Read objects from as few close-ups as show them all."""
+    """Read objects from the fewest close-ups that show all of them."""
     objects = [session.panel.object(name) for name in names]
     groups = viewpoints.close_up_groups(objects, session.lens())
     groups = [groups[k] for k in visiting_order(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
@@ -95,14 +95,14 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
 
 
 def _camera_over_panel(session: Session) -> Array:
-    """(3,) panel point that the camera is before."""
+    """Return the panel point (3,) in front of which the camera is."""
     camera = base_from(session, session.first(DeviceKind.CAMERA)).parent_from_child
     x, y, _ = session.known_panel().parent_from_child.inv().apply(camera.translation)
     return np.array([x, y, 0.0])
 
 
 def look_close(session: Session, centre_m: Iterable[float], names: Collection[str]) -> Inspection:
-    """Drive the camera close before a panel point and read what is there."""
+    """Drive the camera close to a panel point and read the named objects there."""
     pose = session.known_panel().parent_from_child
     title = f"close-up of {', '.join(names)}"
     go_to_camera_view(session, viewpoints.close_up_poses(pose, tuple(centre_m)), name=title[:60])
@@ -111,9 +111,9 @@ def look_close(session: Session, centre_m: Iterable[float], names: Collection[st
 
 
 def look_past(session: Session, found: Inspection) -> Inspection:
-    """What is there and could not be read is looked at again from the sides, until it can be.
+    """Look from the sides at objects that are present but could not be read, until they can be read.
 
-    From close by first where the trouble is that two states look alike.
+    Objects of which two states look alike are looked at from a shorter distance.
     """
     unread = [reading for reading in found.readings.values() if reading.present and not reading.answered]
     if len(unread) > MOST_UNREAD:
@@ -133,7 +133,7 @@ def look_past(session: Session, found: Inspection) -> Inspection:
             pictures += _from_the_sides(session, group, looks, sides)
     told = {name: _told(each) for name, each in looks.items()}
     for name in told:
-        session.world.forget_reading(name)  # one look alone may have said what the others contradict
+        session.world.forget_reading(name)  # a single image may have given a reading that the others contradict
     readings = found.readings | told
     session.world.note_readings(readings.values())
     return Inspection(readings=readings, pictures=tuple(pictures))
@@ -145,7 +145,7 @@ def _from_the_sides(
     looks: dict[str, list[ObjectReading]],
     sides: Sequence[str],
 ) -> Iterator[AnnotatedView]:
-    """Pictures from each side that the arm reaches and the panel shows at, until all is told; readings go to `looks`."""
+    """Yield pictures from each side that the arm reaches, until all objects are read; appends readings to `looks`."""
     flange_from_camera = session.mount(session.first(DeviceKind.CAMERA)).parent_from_child
     camera_from_tips = flange_from_camera.inv() * skill_context(session).flange_from_grip
     pose = session.known_panel().parent_from_child
@@ -171,7 +171,7 @@ def _from_the_sides(
 
 
 def _told(looks: Sequence[ObjectReading]) -> ObjectReading:
-    """What a straight look and those from the sides say together."""
+    """Return the reading that results from the frontal view and the side views together."""
     told = merge_views(looks)
     if told.answered or len(looks) == 1:
         return told
@@ -179,7 +179,7 @@ def _told(looks: Sequence[ObjectReading]) -> ObjectReading:
 
 
 def reading_result(reading: ObjectReading, when: str) -> ReadingResult:
-    """A reading as the report keeps it."""
+    """Return a reading in the form of the report."""
     return ReadingResult(
         name=reading.name,
         kind=reading.kind,
@@ -197,7 +197,7 @@ def reading_result(reading: ObjectReading, when: str) -> ReadingResult:
 
 
 def run_inspect(session: Session, request: InspectRequest) -> InspectResult:
-    """The verb `inspect`."""
+    """Run the verb `inspect`."""
     if request.image is not None:
         session.progress(0.1, "look at the stored image")
         return read_stored(session, request)
@@ -208,7 +208,7 @@ def run_inspect(session: Session, request: InspectRequest) -> InspectResult:
 
 
 def run_recognise_taught(session: Session, request: RecogniseRequest) -> InspectResult:
-    """The verb `recognise` with a taught panel, by vision."""
+    """Run the verb `recognise` by vision with a taught panel."""
     names = panel_object_or_all(session.panel, request.objects)
     if request.move:
         ensure_located(session.part(0.0, 0.5))
@@ -220,7 +220,7 @@ def run_recognise_taught(session: Session, request: RecogniseRequest) -> Inspect
 
 
 def ensure_located(session: Session) -> None:
-    """Locate the panel unless that was done before."""
+    """Locate the panel unless its pose is known already."""
     if session.world.base_from_panel is not None:
         return
     session.progress(0.1, "drive to the overview")
@@ -229,15 +229,15 @@ def ensure_located(session: Session) -> None:
 
 
 def missing(readings: Iterable[ObjectReading], wanted: Iterable[PanelObject]) -> tuple[str, ...]:
-    """Names of objects that are not where the panel file says."""
+    """Return the names of objects that are not where the panel file says."""
     present = {r.name for r in readings if r.present}
     return tuple(panel_object.name for panel_object in wanted if panel_object.name not in present)
 
 
 def need_all_present(found: Inspection, session: Session) -> None:
-    """Raise `NotFound` naming what is missing.
+    """Raise `NotFound` if an object is missing; the error names it.
 
-    Working a panel that is not the one in the file would be dangerous.
+    It would be dangerous to operate a panel that differs from its file.
     """
     lost = missing(found.readings.values(), session.panel.objects)
     if lost:
@@ -249,7 +249,7 @@ def need_all_present(found: Inspection, session: Session) -> None:
 
 
 def _answer(session: Session, found: Inspection, least_confidence: float) -> InspectResult:
-    """The answer to a caller to whom so much confidence is enough; what the cell remembers and draws is the default's."""
+    """Return the answer at the caller's least confidence; stored readings and pictures keep the default."""
     readings = [answer_at(reading, least_confidence) for reading in found.readings.values()]
     pictures = [
         session.context.task.artefact(f"annotated-{k}.png", png_of(picture.pixels), "image/png")

@@ -1,4 +1,4 @@
-"""Where is the panel? Lights on minus lights off, four-light pose, and the plate's plane by range."""
+"""Locates the panel: its pose from the four border lights, and the plane of its plate from a range image."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from service.world_model import expected_panel
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Located:
-    """The panel found by its lights.
+    """The pose of the panel from its lights.
 
     Attributes:
-        base_from_panel: with covariance (image noise and camera mounting).
+        base_from_panel: the pose, with the covariance from image noise and camera mount.
         lights_px: (4, 2) in the order of the panel file.
     """
 
@@ -38,7 +38,7 @@ class Located:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScannedPlane:
-    """The plate's plane found by the range scanner."""
+    """The plane of the plate from a range image."""
 
     fit: PlaneFit
     scan: Scan
@@ -46,7 +46,7 @@ class ScannedPlane:
 
 
 def go_to_overview(session: Session) -> None:
-    """Drive the camera to where it sees the whole panel."""
+    """Drive the camera to a pose from which it sees the whole panel."""
     known = session.world.base_from_panel
     if known is None:
         leave_the_panel(session)
@@ -57,10 +57,10 @@ def go_to_overview(session: Session) -> None:
 
 
 def locate(session: Session) -> Located:
-    """Find the panel from where the arm stands now; remembers the pose.
+    """Find the panel from the present pose of the arm and store its pose.
 
     Raises:
-        NotFound, Ambiguous: lights missing, wrong, or in a place where the panel cannot be.
+        NotFound, Ambiguous: lights are missing or wrong, or the panel cannot be where they are.
     """
     session.progress(0.3, "lights off, lights on")
     pair = look_with_lights(session)
@@ -71,7 +71,7 @@ def locate(session: Session) -> Located:
 
 
 def locate_in(session: Session, pair: LightPair) -> Located:
-    """The panel's pose in a pair of images."""
+    """Return the panel's pose from a pair of images."""
     look, workspace = pair.on, session.cell.file.workspace
     camera_from_base = look.base_from_camera.parent_from_child.inv()
     found = find_panel(
@@ -98,10 +98,10 @@ def locate_in(session: Session, pair: LightPair) -> Located:
 
 
 def lights_in(session: Session, pair: LightPair) -> AssignedLights:
-    """The panel's lights in a pair of images, in the order of the panel file.
+    """Find the panel's lights in a pair of images, in the order of the panel file.
 
     Raises:
-        NotFound, Ambiguous: not all are seen, or something else stands where they should.
+        NotFound, Ambiguous: not all of them are visible, or other lights are in their places.
     """
     look = pair.on
     upright = look.base_from_camera.parent_from_child.inv() * session.believed_panel().parent_from_child
@@ -115,15 +115,15 @@ def _lights_m(session: Session) -> Array:
 
 
 def scan_plate(session: Session) -> ScannedPlane:
-    """The plate's plane from where the arm stands now."""
+    """Scan from the present pose of the arm and fit the plane of the plate."""
     return plate_in(session, scan(session))
 
 
 def plate_in(session: Session, image: Scan) -> ScannedPlane:
-    """The plate's plane in a range image that was taken from where the arm stands now.
+    """Fit the plane of the plate to a range image that was taken from the present pose of the arm.
 
     Raises:
-        NotFound: no plane near where the panel is believed to be, or a scanner that is no pinhole.
+        NotFound: there is no plane near the estimated pose of the panel, or the image is not a pinhole projection.
     """
     believed = session.believed_panel()
     scanner_from_panel = compose(image.base_from_scanner.inverse(), believed)
@@ -156,7 +156,7 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
 
 
 def run_panel_pose(session: Session, request: PanelPoseRequest) -> PanelPoseResult:
-    """The verb `panel-pose`."""
+    """Run the verb `panel-pose`."""
     if request.move:
         session.progress(0.05, "drive to the overview")
         go_to_overview(session)

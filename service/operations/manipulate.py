@@ -1,4 +1,4 @@
-"""The verb `manipulate`: what a deed shall reach, the skill for its kind, a second look, and what both say."""
+"""The verb `manipulate`: determines the target of an action, runs the skill of the kind, and reads the result back."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.schema.requests import ActionBody, ManipulateRequest, MissionReques
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Deed:
-    """A control that was worked: the skill's report and the looks before and after."""
+    """A control that was operated: the skill's report, and the readings before and after."""
 
     action: ActionResult
     report: SkillReport
@@ -32,10 +32,10 @@ class Deed:
 
 
 def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
-    """Work one control and look whether it worked.
+    """Operate one control and read back whether it reached its target.
 
     Raises:
-        InvalidRequest: the object cannot be worked, or has no such state or value.
+        InvalidRequest: the object cannot be operated, or has no such state or value.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     panel_object = session.panel.object(body.object)
@@ -67,10 +67,10 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
 
 
 def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
-    """What a deed shall reach; the usual deed of its kind when nothing is asked.
+    """Return the target of an action; the usual target of the kind when the request names none.
 
     Raises:
-        InvalidRequest: the object cannot be worked, or has no such state or value.
+        InvalidRequest: the object cannot be operated, or has no such state or value.
     """
     goal = panel_object.goal
     if goal is None or not has_part(SKILLS, panel_object.kind):
@@ -78,7 +78,7 @@ def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
             f"{panel_object.name} is a {panel_object.kind}, which cannot be worked: it is read only",
             hint=f"kinds that can be: {', '.join(registered(SKILLS))}",
         )
-    for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # what is meant must not be guessed
+    for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # refused, because its meaning would be a guess
         if getattr(body, other) is not None:
             hint = f"send {{'object': '{panel_object.name}', '{goal.key}': ...}}"
             what = f"{panel_object.name} is a {panel_object.kind}: it takes {goal.key}, not {other}"
@@ -87,23 +87,23 @@ def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
 
 
 def text_of(panel_object: PanelObject, target: str | float) -> str:
-    """A target as a report has it."""
+    """Return a target as text for reports."""
     return str(target) if panel_object.goal is None else panel_object.goal.text(target)
 
 
 def check_manipulate(cell: Cell, request: ManipulateRequest) -> None:
-    """Raise `InvalidRequest` for a deed that makes no sense on the cell's panel."""
+    """Raise `InvalidRequest` for an action that is not possible on the cell's panel."""
     target_of(cell.panel.object(request.object), request)
 
 
 def check_mission(cell: Cell, request: MissionRequest) -> None:
-    """Raise `InvalidRequest` when one of the deeds makes no sense on the cell's panel."""
+    """Raise `InvalidRequest` when one of the actions is not possible on the cell's panel."""
     for body in request.actions or ():
         target_of(cell.panel.object(body.object), body)
 
 
 def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateResult:
-    """The verb `manipulate`."""
+    """Run the verb `manipulate`."""
     ensure_located(session.part(0.0, 0.3))
     session.progress(0.3, f"work {request.object}")
     deed = work(session.part(0.3, 1.0), request, verify=request.verify)
@@ -114,7 +114,7 @@ def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateRe
 
 
 class _Eye:
-    """The second look at one control; what it saw last is kept."""
+    """Reads one control back through its witness, the object that shows its state; keeps the last reading."""
 
     def __init__(self, session: Session, panel_object: PanelObject, is_open: bool) -> None:
         self._session = session
@@ -125,14 +125,14 @@ class _Eye:
         self.picture: Picture | None = None
 
     def before(self) -> ObjectReading | None:
-        """What the witness showed before: the newest reading, or a look."""
+        """Return what the witness showed before the action: the newest reading, or a new one."""
         known = self._session.world.readings.get(self.witness.name)
         if known is not None or not self._is_open:
             return known
         return self._look()
 
     def verify(self) -> Verify | None:
-        """The callback of the skill; None when nobody shall look."""
+        """Return the skill's read-back function; None when no read-back is wanted."""
         return self._verify if self._is_open else None
 
     def _verify(self) -> ObjectState | None:
@@ -146,7 +146,7 @@ class _Eye:
             straight = look_close(self._session, self.witness.point_m, (self.witness.name,))
             found = look_past(self._session, straight)
         except (PerceptionError, Unreachable):
-            return None  # "cannot tell" is an answer; the outcome will be `unverified`
+            return None  # an inconclusive read-back makes the outcome `unverified`
         self.picture = Picture(
             name=f"after-{self._panel_object.name}",
             title=f"second look at {self.witness.name}",
@@ -157,7 +157,7 @@ class _Eye:
 
 
 def state_of(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
-    """A reading in the words of the skills."""
+    """Convert a reading to the object state that skills use."""
     angle_rad = reading.value if panel_object.value_is_angle else None
     if angle_rad is None and reading.state is not None:
         angle_rad = panel_object.resting_angles.get(reading.state)

@@ -1,4 +1,4 @@
-"""The whole mission: find the panel, look at everything, feel for it, work its controls, look again, and go home."""
+"""The whole mission: locates and reads the panel, touches it, operates its controls, reads them back, and parks."""
 
 from __future__ import annotations
 
@@ -39,12 +39,13 @@ BEFORE = "before the actions"
 
 
 def run_mission(context: OperationContext, request: MissionRequest) -> MissionResult:
-    """The verb `missions`.
+    """Run the verb `missions`.
 
-    Whatever happens, the arm is parked if it still obeys and has not failed itself, and the report tells what is known.
+    After any error the arm is parked, unless it has failed itself or does not obey, and the report is written with
+    everything that is known.
 
     Raises:
-        CellError: what ended the mission early; the report is written first.
+        CellError: the error that ended the mission early; the report is written first.
     """
     connection = context.connection
     name = time.strftime("%Y%m%dT%H%M%S", time.gmtime()) + f"-{context.task.id}"
@@ -64,7 +65,7 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         _park_after(session, record, error)
         raise
     except Exception as defect:
-        # A defect of ours must not leave the arm at the panel; it goes on to the task, which reports it as one.
+        # Park the arm also after a defect of this program; the task then reports the defect.
         record.problem = {
             "title": "Defect",
             "detail": f"{type(defect).__name__}: {defect}",
@@ -88,7 +89,7 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
 
 
 def _report(record: MissionRecord, folder: Path) -> bool:
-    """Write the report; on a full disk what was done and read is still worth telling, so only the log complains."""
+    """Write the report; returns False and logs the reason when that fails, because the task's result still counts."""
     try:
         write_report(record, folder)
     except OSError as error:
@@ -101,7 +102,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
     with _step(session, "overview", 0.0, 0.06) as part:
         part.progress(0.0, "drive to the overview")
         leave_the_panel(part)
-        session.world.forget()  # another panel may stand there: a mission believes nothing that it has not seen
+        session.world.forget()  # a mission uses only its own observations, because the panel may have been exchanged
         go_to_overview(part)
     with _step(session, "lights", 0.06, 0.10) as part:
         first = locate(part)
@@ -117,7 +118,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         by_surfaces = view_surfaces(part, plane, OVERVIEW)
     with _step(session, "recognise", 0.19, 0.22) as part:
         part.progress(0.0, "recognise the objects")
-        settle(part)  # the border lights go out
+        settle(part)  # until the border lights are out
         found = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, found, "recognised")
         need_all_present(found, session)
@@ -162,7 +163,7 @@ def _work_all(session: Session, record: MissionRecord, request: MissionRequest, 
 
 
 def usual_actions(session: Session) -> tuple[ActionBody, ...]:
-    """For each kind that ranks itself, its best-placed object is brought to another state or value than it shows now."""
+    """Return one action for each kind with a mission rank: change the state or value of its best-ranked object."""
     readings = session.world.readings
     ranked = [(one.mission_rank, one) for one in session.panel.objects if one.mission_rank is not None]
     first: dict[str, PanelObject] = {}
@@ -172,7 +173,7 @@ def usual_actions(session: Session) -> tuple[ActionBody, ...]:
 
 
 def _other(panel_object: PanelObject, readings: Mapping[str, ObjectReading]) -> ActionBody:
-    """The deed that changes what the object, or what it works, shows now."""
+    """Return the action that changes the present state or value of the object, or of the object that shows it."""
     reading, goal = readings.get(panel_object.shown_by), panel_object.goal
     if goal is None:
         raise InvalidRequest(f"{panel_object.name} is read only", hint="leave it out of the mission")
@@ -190,9 +191,9 @@ def _step(session: Session, name: str, low: float, high: float) -> Iterator[Sess
 
 
 def _park_after(session: Session, record: MissionRecord, error: Exception) -> None:
-    """Bring the arm home after an error, if the cell still obeys; a second error is told, not hidden.
+    """Park the arm after an error, if the cell still obeys; a second error is recorded too.
 
-    An arm that failed itself is left where it stands: whoever goes near it must not see it move.
+    An arm that has failed itself is not moved, because a person may be near it.
     """
     if isinstance(error, DeviceError) and error.details.get("device") in session.cell.names_of(DeviceKind.ARM):
         record.not_parked = f"{error.what}: the arm was not parked; look at it, then reset the stop"
@@ -246,7 +247,7 @@ def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:
 
 
 def _places(session: Session, found: Inspection) -> list[ObjectPlace]:
-    """Every object in 3-D: base frame, metres."""
+    """Return the position of every object in the base frame, m."""
     pose = session.known_panel().parent_from_child
     return [
         ObjectPlace(name=r.name, kind=r.kind, centre_in_base_m=pose.apply(r.centre_m))
@@ -256,7 +257,7 @@ def _places(session: Session, found: Inspection) -> list[ObjectPlace]:
 
 
 def _drawing(session: Session, located: Located) -> Picture:
-    """The panel's outlines in the fused pose over the image, as in the paper's Fig. 13."""
+    """Draw the panel's outlines in the fused pose over the image, as in the paper's Fig. 13."""
     look = located.pair.off
     camera_from_panel = compose(look.base_from_camera.inverse(), session.known_panel())
     png = panel_drawing(session.panel, camera_from_panel.parent_from_child, look.intrinsics, look.pixels)

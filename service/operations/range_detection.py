@@ -1,7 +1,8 @@
-"""Objects of the panel file by their surfaces in a range image, and whether they stand where layout and vision have them.
+"""Finds objects of the panel file by their surfaces in a range image and compares them with panel file and vision.
 
-These are the kinds with a relief, such as mushroom buttons and handwheels. What is not found, or found elsewhere, is looked
-at again from near by and stated. Nothing is overridden: what still stands elsewhere after the second look is not worked.
+This covers the kinds with a relief, such as mushroom buttons and handwheels. An object that is not found, or is found
+in another place, is scanned again from a shorter distance. The panel file is not corrected: an object that is still
+found in another place is reported and not operated.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from service.report.record import Picture
 from service.report.surfaces import Mark, surfaces_picture
 from service.schema.mission_results import SurfaceCheck
 
-OUTLINE_POINTS = 48  # of the circle that is drawn around an object
-ELSEWHERE_P = 1e-3  # one object in a thousand that stands in its place is looked at twice
-TURN_SLACK_RAD = 0.1  # a wheel's angle by its spokes and by its mark, beside three sigmas
+OUTLINE_POINTS = 48  # points of the circle that is drawn around an object
+ELSEWHERE_P = 1e-3  # probability that an object in its right place is scanned twice
+TURN_SLACK_RAD = 0.1  # allowed between a wheel's angle by its spokes and by its mark, in addition to three sigmas
 OVERVIEW, CLOSER = "the overview", "a closer look"
 
 
 def surfaces_in(image: Scan) -> RangeScene:
-    """The range image analysed.
+    """Segment a range image into surfaces.
 
     Raises:
-        Unsupported: a scanner that is no pinhole.
+        Unsupported: the image is not a pinhole projection.
         InvalidRequest, NotFound: see `analyse`.
     """
     c = image.capabilities
@@ -51,7 +52,7 @@ def surfaces_in(image: Scan) -> RangeScene:
 def find_by_surfaces(
     scene: RangeScene, image: Scan, panel: Panel, base_from_panel: UncertainPose, plate: Surface
 ) -> list[Sighting]:
-    """Where the scan shows the panel's objects that have a relief; see `find_objects`."""
+    """Find the panel's objects with a relief in a scan; see `find_objects`."""
     depth_m = np.asarray(image.depth_m, float)
     view = PanelView(
         scene=scene,
@@ -64,7 +65,7 @@ def find_by_surfaces(
 
 
 def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> Mark:
-    """The object's outline at its height: where it was found, or else where it was looked for."""
+    """Return the object's outline at its height, where it was found or else where it was looked for."""
     panel_object = sighting.panel_object
     found = sighting.base_from_object
     base_from_object = (
@@ -87,7 +88,7 @@ def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SurfaceView:
-    """One scan, its surfaces, and what of the panel file was found in it; `place`: where the arm looked from."""
+    """One scan with its surfaces and the objects found in it; `place` describes the pose of the arm."""
 
     place: str
     scan: Scan
@@ -96,14 +97,14 @@ class SurfaceView:
 
 
 def view_surfaces(session: Session, plane: ScannedPlane, place: str) -> SurfaceView:
-    """The mushrooms and handwheels in a scan whose plate is known."""
+    """Find the objects with a relief in a scan whose plate is known."""
     scene = surfaces_in(plane.scan)
     found = find_by_surfaces(scene, plane.scan, session.panel, session.believed_panel(), plane.fit.surface)
     return SurfaceView(place=place, scan=plane.scan, scene=scene, sightings=tuple(found))
 
 
 def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCheck], list[Picture]]:
-    """Judge what was seen from the overview, and look closer where that disagrees or shows nothing.
+    """Compare the objects seen from the overview; scan those again that disagree or were not found.
 
     Raises:
         NotFound: the panel has not been located.
@@ -131,10 +132,10 @@ def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCh
 def compared(
     sighting: Sighting, base_from_panel: UncertainPose, position_m: float, reading: ObjectReading | None, place: str
 ) -> SurfaceCheck:
-    """A sighting held against the panel file and against what vision says.
+    """Compare a sighting with the panel file and with vision.
 
     Args:
-        position_m: how far an object of a built panel stands from its place in the file, one sigma.
+        position_m: one sigma of the distance between an object of a built panel and its place in the file.
     """
     panel_object, match = sighting.panel_object, sighting.match
     if match is None or sighting.base_from_object is None:
@@ -167,17 +168,17 @@ def compared(
 
 
 def after_both(first: SurfaceCheck, second: SurfaceCheck) -> SurfaceCheck:
-    """What two looks say together: the closer one where it found the object, and both are told."""
+    """Combine two scans of an object: the second one counts if it found the object; the text mentions both."""
     newest = second if second.found else first
     both = f"from {first.seen_from} {first.finding}; from {second.seen_from} {second.finding}"
     return newest.model_copy(update={"finding": both})
 
 
 def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:
-    """Refuse to work an object that stands elsewhere by its surfaces: the fingers would go to where the file has it.
+    """Refuse to operate an object that is not in its place, because the fingers would go to its place in the file.
 
     Raises:
-        NotFound: the object was found elsewhere, twice if it could be looked at twice.
+        NotFound: the object was found in another place, in both scans if there were two.
     """
     for check in checks:
         if check.name == name and check.stands_elsewhere:
@@ -188,7 +189,7 @@ def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:
 
 
 def _shown(sighting: Sighting) -> str | None:
-    """The state by surfaces in the words of vision; a wheel's spokes look the same after each."""
+    """Return the state by surfaces in the terms of vision; a wheel's angle is known modulo one spoke."""
     relief, state = sighting.panel_object.relief, sighting.state
     if state is None or relief is None:
         return None
@@ -206,7 +207,7 @@ def _said(panel_object: PanelObject, reading: ObjectReading | None) -> str | Non
 
 
 def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
-    """Do surfaces and vision give the same state? Where one of them gives none, nothing contradicts."""
+    """Return whether surfaces and vision give the same state, or at least one of them gives none."""
     relief, match, state = sighting.panel_object.relief, sighting.match, sighting.state
     if relief is None or match is None or state is None or reading is None or not reading.answered:
         return True
@@ -221,7 +222,7 @@ def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
 
 
 def _look_closer(session: Session, panel_object: PanelObject) -> SurfaceView | str:
-    """The scanner square before the object; text says why not."""
+    """Scan the object from a pose perpendicular to it; returns the reason as text when that is not possible."""
     flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
     views = viewpoints.close_up_poses(session.known_panel().parent_from_child, panel_object.point_m)
     try:

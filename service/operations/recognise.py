@@ -1,4 +1,4 @@
-"""The verbs `recognise` and `learn`: objects by vision, surfaces by range, and looks that the panel itself teaches."""
+"""The verbs `recognise` and `learn`: find objects by vision and surfaces by range, and learn looks from the panel."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def run_recognise(session: Session, request: RecogniseRequest) -> RecogniseResult:
-    """Objects of the panel file or of any panel in the image, and surfaces in the range image, as asked."""
+    """Run the verb `recognise`: find objects of the panel file or of any panel, and surfaces in the range image."""
     if request.image is not None:
         session.progress(0.1, "look at the stored image")
         if request.mode == "blind":
@@ -45,7 +45,7 @@ def run_recognise(session: Session, request: RecogniseRequest) -> RecogniseResul
 
 
 def _blind(session: Session, request: RecogniseRequest) -> RecogniseResult:
-    """Which kinds of object are where in this image, without a panel file."""
+    """Find kinds of objects and their places in an image, without a panel file."""
     if request.move:
         session.progress(0.1, "drive to the overview")
         go_to_overview(session)
@@ -58,7 +58,7 @@ def _blind(session: Session, request: RecogniseRequest) -> RecogniseResult:
 
 
 def _by_range(session: Session, request: RecogniseRequest) -> dict[str, object]:
-    """The fields of an answer that one range image gives: its surfaces, and the objects whose surfaces are among them."""
+    """Return the fields of the answer that come from one range image: its surfaces, and the objects found by them."""
     if request.move and "vision" not in request.use:
         ensure_located(session.part(0.0, 0.6))
         session.progress(0.6, "drive to the overview")
@@ -75,7 +75,7 @@ def _by_range(session: Session, request: RecogniseRequest) -> dict[str, object]:
         sightings = find_by_surfaces(scene, image, session.panel, believed, fit.surface)
         plate = int(np.bincount(scene.labels[fit.inliers]).argmax()) or None
     except NotFound as error:
-        no_plate = error.what  # what else is seen is an answer, too
+        no_plate = error.what  # the other surfaces are still an answer
     drawn = surfaces_picture(scene, [mark_of(sighting, image, believed) for sighting in sightings])
     return {
         "surfaces": [_surface_result(surface) for surface in scene.surfaces],
@@ -115,11 +115,11 @@ def _sighting_result(sighting: Sighting) -> SurfaceSighting:
 
 
 def run_learn(session: Session, request: LearnRequest) -> LearnResult:
-    """Learn the looks of the panel's objects from an overview of now, or from a stored one.
+    """Learn the looks of the panel's objects from a new or a stored overview.
 
     Raises:
-        NoSuchImage, NoSuchKnowledge: unknown image or panel.
-        InvalidRequest, NotObservable, NotFound, Ambiguous: the overview teaches nothing; says why and what helps.
+        NoSuchImage, NoSuchKnowledge: the image or the panel is unknown.
+        InvalidRequest, NotObservable, NotFound, Ambiguous: nothing can be learned from the overview.
     """
     from perception.vision import CameraProjection
 
@@ -149,7 +149,7 @@ def _learn(session: Session, pixels: Pixels, view: PanelProjection, panel: Panel
 
 
 def _drawn(pixels: Pixels, looks: PanelLooks) -> Pixels:
-    """The overview with the objects that taught: green are recognised blind now, amber are not."""
+    """Draw the objects that gave looks over the overview: green if blind recognition finds them now, else amber."""
     from perception.vision import draw_outlines
 
     return draw_outlines(

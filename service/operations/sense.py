@@ -1,6 +1,7 @@
-"""The verb `fuse`: feeling for the panel with every sense, and one pose from all that was sensed.
+"""The verb `fuse`: measures the panel with all sensors and fuses the measurements into one pose.
 
-The plate is hovered over and touched at the place that tells most per second, until the pose is as good as wanted.
+The fingers hover over the plate and touch it, each time at the place with the highest expected gain per second, until
+the pose is as accurate as wanted.
 """
 
 from __future__ import annotations
@@ -38,24 +39,24 @@ from service.operations.travel import skill_context
 from service.schema.fuse_request import FuseRequest
 from service.schema.fuse_results import FuseResult, TouchingResult, TouchResult, answer_of
 
-HOVER_M = 0.05  # of the fingertips above the plate while the proximity sensors look
+HOVER_M = 0.05  # height of the fingertips above the plate while the proximity sensors are read
 HOVER_SAMPLES = 5
 LEAST_TOUCHES = 3
-REST_S = 0.02  # two readings of a proximity sensor
-SPARE_SPOTS = 2  # more places than touches, to replace those that the arm cannot reach
-TOUCH_SIGMA_M = 0.0003  # what `touch_probe` states
+REST_S = 0.02  # the time of two readings of a proximity sensor
+SPARE_SPOTS = 2  # additional places, which replace those that the arm cannot reach
+TOUCH_SIGMA_M = 0.0003  # as stated by `touch_probe`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Felt:
-    """What the fingers found: observations, and what each touch was worth."""
+    """The result of touching: the observations, and the gain of each touch."""
 
     observations: tuple[Observation, ...]
     account: TouchingResult
 
 
 def fuse_and_remember(session: Session, observations: Sequence[Observation]) -> FusedObservations:
-    """One pose from all observations; the cell believes it from now on."""
+    """Fuse all observations into one pose and store it as the cell's estimate."""
     fused = fuse_observations(
         observations,
         mounts_of(session, observations),
@@ -67,13 +68,13 @@ def fuse_and_remember(session: Session, observations: Sequence[Observation]) -> 
 
 
 def fused_result(answer: FusedObservations, felt: Felt) -> FuseResult:
-    """The fused pose as reports and the API give it."""
+    """Return the fused pose in the form of reports and the API."""
     result = answer_of(answer.base_from_panel, answer.fused, answer.measurements)
     return result.model_copy(update={"touching": felt.account})
 
 
 def run_fuse(session: Session, request: FuseRequest) -> FuseResult:
-    """The verb `fuse`: measurements that are given, or collected."""
+    """Run the verb `fuse` with the given measurements, or with measurements that the cell collects."""
     if request.collect:
         observations, felt = collect(session, request)
         return fused_result(fuse_and_remember(session, observations), felt)
@@ -90,7 +91,7 @@ def run_fuse(session: Session, request: FuseRequest) -> FuseResult:
 
 
 def collect(session: Session, request: FuseRequest) -> tuple[tuple[Observation, ...], Felt]:
-    """Look, scan, hover and touch: all observations, and what was felt."""
+    """Take images, scan, hover and touch; returns all observations, and the result of touching."""
     ensure_located(session.part(0.0, 0.2))
     go_to_overview(session)
     found: Located = locate(session.part(0.2, 0.3))
@@ -101,29 +102,29 @@ def collect(session: Session, request: FuseRequest) -> tuple[tuple[Observation, 
 
 
 def light_observations(located: Sequence[Located]) -> tuple[PixelObservation, ...]:
-    """The rays of several looks together."""
+    """Return the rays to the lights from several image pairs together."""
     return tuple(ray for found in located for ray in found.observations)
 
 
 def feel(session: Session, touches: int, known: Sequence[Observation], tolerance: PoseTolerance) -> Felt:
-    """Hover over and touch bare places of the plate, each time the one that tells most per second.
+    """Hover over and touch free places of the plate, each time the one with the highest expected gain per second.
 
-    Ends when the pose is good enough, when no further place is worth the time, or after `touches` places.
+    It ends when the pose is accurate enough, when no further place is worth the time, or after `touches` places.
 
     Args:
-        touches: at most so many.
-        known: what has been observed already.
-        tolerance: how well the pose is wanted.
+        touches: the largest number of touches.
+        known: the observations made so far.
+        tolerance: the wanted accuracy of the pose.
 
     Raises:
-        NotFound: fewer than three places could be touched and the pose is not good enough; says why.
+        NotFound: fewer than three places could be touched, and the pose is not accurate enough; gives the reasons.
         Stopped: somebody stopped the cell.
     """
     return follow(session, touch_plan(session, touches, known, tolerance), touches)
 
 
 def follow(session: Session, plan: TouchPlan, touches: int) -> Felt:
-    """Touch as the plan says; see `feel`."""
+    """Touch the places of the plan in order of their gain; see `feel`."""
     observations: list[Observation] = []
     accounts: list[TouchResult] = []
     skipped: list[str] = []
@@ -145,7 +146,7 @@ def follow(session: Session, plan: TouchPlan, touches: int) -> Felt:
         try:
             found = _feel_at(session, spot, monitor)
         except Stopped:
-            raise  # no place is at fault
+            raise  # another place would not help
         except (SkillFailure, MotionError) as failure:
             skipped.append(f"({spot[0]:.3f}, {spot[1]:.3f}) m: {failure}")
             plan = plan.without(choice.index)
@@ -181,7 +182,7 @@ def mounts_of(session: Session, observations: Sequence[Observation]) -> dict[str
 
 
 def touch_plan(session: Session, touches: int, known: Sequence[Observation], tolerance: PoseTolerance) -> TouchPlan:
-    """Offer bare places of the plate, with what a touch at each would tell."""
+    """Return a plan with free places of the plate and the expected information of a touch at each of them."""
     base_from_panel = session.known_panel().parent_from_child
     spots_m = touch_points(session.panel, touches + SPARE_SPOTS)
     expected = [_expected_at(session, base_from_panel, spot) for spot in spots_m]
@@ -198,7 +199,7 @@ def touch_plan(session: Session, touches: int, known: Sequence[Observation], tol
 
 
 def _expected_at(session: Session, base_from_panel: RigidTransform, spot: Array) -> list[Observation]:
-    """What hovering over a place and touching it would give if the panel stood where it is believed."""
+    """Return the observations expected from hovering over a place and touching it, at the estimated panel pose."""
     gripper = session.first(DeviceKind.GRIPPER)
     flange_from_grip = session.mount(gripper).parent_from_child
     facing = Rotation.from_rotvec([np.pi, 0.0, 0.0])  # the fingers point into the plate
@@ -231,7 +232,7 @@ def _proximity_sensors(session: Session) -> list[str]:
 
 
 def _fingers_over_panel(session: Session) -> Array:
-    """(2,) panel point that the finger tips are over."""
+    """Return the panel point (2,) under the finger tips."""
     context = skill_context(session)
     tip = context.mover.state().base_from_flange * context.flange_from_grip
     return np.asarray(context.panel_pose.inv().apply(tip.translation)[:2])
@@ -293,6 +294,6 @@ def _feel_at(session: Session, spot: Array, monitor: plausibility.ProximityMonit
 
 
 def _whose(names: Sequence[str], mounts: Sequence[Any], flange: Any, base_from_sensor: Any) -> str:
-    """Which sensor stood there: the probe leaves out sensors that saw nothing."""
+    """Return the name of the sensor at a pose, because the probe leaves out sensors that measured nothing."""
     gaps = [np.linalg.norm((flange * mount).translation - base_from_sensor.translation) for mount in mounts]
     return names[int(np.argmin(gaps))]

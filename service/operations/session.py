@@ -1,4 +1,4 @@
-"""What all operations share while they run: the cell, what is known of it, and a hand on its motion port."""
+"""The state that all operations share while they run: the cell, the known facts, and the motion port."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from service.world_model import WorldModel, expected_panel
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OperationContext:
-    """Handed to every operation. `runs_dir` is where missions leave their reports."""
+    """The inputs of every operation; missions write their reports into `runs_dir`."""
 
     connection: CellConnection
     task: TaskContext
@@ -33,29 +33,29 @@ class OperationContext:
 
 
 class NotedMover:
-    """A motion port that keeps what went through it, and starts nothing for a cancelled task."""
+    """A motion port that records the motions and starts none for a cancelled task."""
 
     def __init__(self, mover: Mover, session: Session) -> None:
         self._mover = mover
         self._session = session
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
-        """As `hal.motion.Mover.execute`."""
+        """Execute the motion; see `hal.motion.Mover.execute`."""
         self._session.context.task.check_cancelled()
         report = self._mover.execute(motion)
         self._session.note(report)
         return report
 
     def cancel(self) -> None:
-        """As `hal.motion.Mover.cancel`."""
+        """End the running motion; see `hal.motion.Mover.cancel`."""
         self._mover.cancel()
 
     def tare(self) -> Array:
-        """As `hal.motion.Mover.tare`."""
+        """Zero the contact wrench; see `hal.motion.Mover.tare`."""
         return self._mover.tare()
 
     def state(self) -> RobotState:
-        """As `hal.motion.Mover.state`."""
+        """Return the newest state; see `hal.motion.Mover.state`."""
         return self._mover.state()
 
 
@@ -64,8 +64,8 @@ class Session:
     """One running operation.
 
     Attributes:
-        record: where a mission keeps what happens; None outside missions.
-        span: the part of the task's progress that is this operation's, from 0 to 1.
+        record: the record of the mission; None outside missions.
+        span: the part of the task's progress, within 0 to 1, that this operation covers.
     """
 
     context: OperationContext
@@ -80,7 +80,7 @@ class Session:
 
     @property
     def cell(self) -> Cell:
-        """The cell file with everything it points to."""
+        """The cell file with the files that it names."""
         return self.context.connection.cell
 
     @property
@@ -90,16 +90,16 @@ class Session:
 
     @property
     def mover(self) -> NotedMover:
-        """The motion port; every motion through it is kept in the record."""
+        """The motion port; its motions are recorded."""
         return NotedMover(self.context.connection.mover, self)
 
     @property
     def world(self) -> WorldModel:
-        """What the cell has found out so far."""
+        """The facts that the cell has measured so far."""
         return self.context.world
 
     def progress(self, fraction: float, step: str, detail: str = "") -> None:
-        """Tell watchers how far this operation is (0 to 1).
+        """Report the progress of this operation, 0 to 1.
 
         Raises:
             Cancelled: the task was cancelled.
@@ -108,7 +108,7 @@ class Session:
         self.context.task.progress(low + fraction * (high - low), step, detail)
 
     def part(self, low: float, high: float) -> Session:
-        """The same session for a part of the work."""
+        """Return the same session for a part of the work, given as a range of this session's progress."""
         a, b = self.span
         return Session(
             context=self.context,
@@ -120,10 +120,10 @@ class Session:
     def run(
         self, motion: DeclaredMotion, *, expect: Collection[MotionOutcome] = (MotionOutcome.COMPLETED,)
     ) -> MotionReport:
-        """Execute a declared motion and keep its report.
+        """Execute a declared motion and record its report.
 
         Raises:
-            Stopped, DeviceFault, MotionError: it ended in none of the expected ways.
+            Stopped, DeviceFault, MotionError: it ended with an outcome that is not in `expect`.
             Cancelled: the task was cancelled meanwhile.
         """
         report = self.mover.execute(motion)
@@ -132,14 +132,14 @@ class Session:
         return report
 
     def note(self, report: MotionReport) -> None:
-        """Keep the report of a motion."""
+        """Record the report of a motion."""
         if self.record is not None:
             self.record.motions.append(report)
         for observe in self.observers:
             observe(report)
 
     def first(self, kind: DeviceKind) -> str:
-        """Name of the first device of a kind.
+        """Return the name of the first device of a kind.
 
         Raises:
             ConfigError: the cell file has none.
@@ -154,25 +154,25 @@ class Session:
         return names[0]
 
     def has_mount(self, device: str) -> bool:
-        """Does the cell file say where this device sits?"""
+        """Return whether the cell file gives a mount for this device."""
         return self.cell.file.devices[device].mount is not None and self.cell.calibration_of(device).mount is not None
 
     def mount(self, device: str) -> UncertainPose:
-        """`flange_from_device` of a mounted device, with the covariance of its calibration."""
+        """Return `flange_from_device` of a mounted device, with the covariance of its calibration."""
         return frame_tree(self.cell, identity()).base_from(device)
 
     def one_sigma_lenses(self) -> dict[str, tuple[CameraIntrinsics, ...]]:
-        """For each camera, its lens with one independent error one sigma large at a time."""
+        """Return for each camera its lens with one independent error of one sigma at a time."""
         records = {
             camera: self.cell.calibration_of(camera).intrinsics for camera in self.cell.names_of(DeviceKind.CAMERA)
         }
         return {camera: record.one_sigma_lenses() for camera, record in records.items() if record is not None}
 
     def lens(self, camera: str | None = None) -> CameraIntrinsics:
-        """Intrinsics of the camera (the first one by default).
+        """Return the intrinsics of the camera (the first one by default).
 
         Raises:
-            ConfigError: its calibration has none.
+            ConfigError: its calibration record has none.
         """
         name = camera or self.first(DeviceKind.CAMERA)
         record = self.cell.calibration_of(name)
@@ -185,15 +185,15 @@ class Session:
         return record.intrinsics.intrinsics()
 
     def lens_rms_px(self, camera: str) -> float:
-        """How well the calibrated lens model fits, px."""
+        """Return the residual of the lens calibration, px."""
         record = self.cell.calibration_of(camera).intrinsics
         return 0.0 if record is None else record.rms_px
 
     def known_panel(self) -> UncertainPose:
-        """Where the panel is believed to stand.
+        """Return the estimated pose of the panel.
 
         Raises:
-            NotFound: nobody has located it yet.
+            NotFound: the panel has not been located yet.
         """
         pose = self.world.base_from_panel
         if pose is None:
@@ -201,7 +201,7 @@ class Session:
         return pose
 
     def believed_panel(self) -> UncertainPose:
-        """The newest pose of the panel, or where the cell file expects it."""
+        """Return the newest estimate of the panel's pose, or the pose that the cell file expects."""
         return self.world.base_from_panel or expected_panel(self.cell)
 
     def _failure(self, report: MotionReport) -> Exception:
@@ -222,10 +222,10 @@ class Session:
 
 
 def panel_object_or_all(panel: Panel, names: Collection[str] | None) -> tuple[str, ...]:
-    """The asked objects in the order of the panel file; all of them for None.
+    """Return the named objects in the order of the panel file; all objects for None.
 
     Raises:
-        InvalidRequest: an unknown name, with the nearest known one.
+        InvalidRequest: a name is unknown; the hint gives the nearest known one.
     """
     if names is None:
         return tuple(panel_object.name for panel_object in panel.objects)
@@ -237,7 +237,7 @@ def panel_object_or_all(panel: Panel, names: Collection[str] | None) -> tuple[st
 
 
 def check_looked_for(cell: Cell, request: InspectRequest | RecogniseRequest) -> None:
-    """Raise `InvalidRequest` for an object that the cell's panel does not have, unless a stored image is asked about."""
+    """Raise `InvalidRequest` for an object that the cell's panel lacks, unless the request names a stored image."""
     if request.image is None:
         for name in request.objects or ():
             cell.panel.object(name)

@@ -1,4 +1,4 @@
-"""Stored images instead of live cameras: the same answers, nothing moves, and nothing is believed of the cell after it."""
+"""Answers from stored images instead of live cameras; nothing moves, and the cell's facts do not change."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from perception.vision import PanelProjection
 
 Pixels = NDArray[np.uint8]
-PICTURE_WIDTH_PX = 1600  # wider pictures are shown smaller: nobody looks at 40 megapixels
+PICTURE_WIDTH_PX = 1600  # wider pictures are reduced to this width for display
 BORDER_SIGMA_PX = 1.0  # of a corner of the plate where two of its sides meet
 
 
 def read_stored(session: Session, request: RecogniseRequest | InspectRequest) -> InspectResult:
-    """A taught panel in a stored image: every object with what it says, and the annotated picture.
+    """Read every object of a taught panel in a stored image; the answer has an annotated picture.
 
     Raises:
-        NoSuchImage, NoSuchKnowledge: unknown image or panel.
-        InvalidRequest, NotObservable, NotFound, Ambiguous: the image cannot be answered for; says why and what helps.
+        NoSuchImage, NoSuchKnowledge: the image or the panel is unknown.
+        InvalidRequest, NotObservable, NotFound, Ambiguous: the image gives no answer; says why and what helps.
     """
     from perception.vision import as_gray, draw_annotated, inspect_view
 
@@ -53,11 +53,7 @@ def read_stored(session: Session, request: RecogniseRequest | InspectRequest) ->
 
 
 def blind_in_stored(session: Session, request: RecogniseRequest) -> RecogniseResult:
-    """Which kinds of object are where in a stored image.
-
-    Raises:
-        as `read_stored`.
-    """
+    """Find kinds of objects and their places in a stored image; errors as for `read_stored`."""
     from perception.vision import as_gray
 
     pixels = _stores(session)[0].pixels(request.image or "")
@@ -74,7 +70,7 @@ def blind_in_stored(session: Session, request: RecogniseRequest) -> RecogniseRes
 def blind_answer(
     session: Session, pixels: Pixels, plate_m: tuple[float, float], *, focal_px: float | None
 ) -> RecogniseResult:
-    """All candidates, refused ones with their reasons, and a picture of the others."""
+    """Return all candidates, the refused ones with their reasons, and a picture of the others."""
     from perception.vision import draw_outlines, recognise
 
     found = recognise(pixels, _stores(session)[1].knowledge(), plate_m=plate_m, focal_px=focal_px)
@@ -89,10 +85,10 @@ def blind_answer(
 
 
 def panel_of(session: Session, name: str | None) -> Panel:
-    """A taught panel by its name; the cell's own for None or its name.
+    """Return a taught panel by its name; the cell's own panel for None or its own name.
 
     Raises:
-        NoSuchKnowledge: nobody taught it.
+        NoSuchKnowledge: no panel of that name was taught.
     """
     if name is None or name == session.panel.name:
         return session.panel
@@ -100,7 +96,7 @@ def panel_of(session: Session, name: str | None) -> Panel:
 
 
 def object_result(reading: ObjectReading, base_from_panel: UncertainPose | None = None) -> ObjectResult:
-    """A reading as the API gives it; with places in the panel and in the base frame when the panel's pose is known."""
+    """Return a reading in the form of the API, with positions in panel and base frame if the panel's pose is known."""
     in_panel_m = reading.centre_m if base_from_panel is not None else None
     in_base_m = None
     if in_panel_m is not None and base_from_panel is not None:
@@ -124,7 +120,7 @@ def object_result(reading: ObjectReading, base_from_panel: UncertainPose | None 
 
 
 def shown(picture: Pixels) -> Pixels:
-    """The picture, no wider than people can see."""
+    """Return the picture, reduced to at most PICTURE_WIDTH_PX."""
     width = picture.shape[1]
     if width <= PICTURE_WIDTH_PX:
         return picture
@@ -138,11 +134,7 @@ def _stores(session: Session) -> tuple[ImageStore, KnowledgeStore]:
 
 
 def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pixels, PanelProjection]:
-    """The stored image of an upright panel, and where the panel is in it.
-
-    Raises:
-        as `read_stored`.
-    """
+    """Return the stored image of an upright panel and the panel's place in it; errors as for `read_stored`."""
     from perception.vision import as_gray, check_upright
 
     pixels = _stores(session)[0].pixels(request.image or "")
@@ -153,7 +145,7 @@ def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pi
 
 
 def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> PanelProjection:
-    """Where the panel is: as the caller says, or by its border, through the lens if that is known."""
+    """Return the panel's place: the caller's, or found by the panel's border, through the lens if it is known."""
     from perception.vision import CameraProjection, estimate, one_plate
 
     lens = _lens(session, request, gray)
@@ -172,7 +164,7 @@ def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> 
 
 
 def _lens(session: Session, request: StoredLook, gray: Pixels) -> CameraIntrinsics | None:
-    """The lens of the request, checked against the image's size."""
+    """Return the lens of the request, checked against the image's size."""
     height, width = gray.shape
     if request.lens is not None:
         return CameraIntrinsics(width_px=width, height_px=height, **request.lens.model_dump())

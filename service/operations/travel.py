@@ -1,4 +1,4 @@
-"""Driving through free space on behalf of a task: motions planned by `manipulation`, from what is known now."""
+"""Drives through free space for a task; `manipulation` plans the motions from the facts that are known now."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def go_to_camera_view(session: Session, base_from_camera: Iterable[RigidTransfor
     """Drive the camera to the first of the poses that the arm reaches without collision.
 
     Raises:
-        Unreachable: none of them.
+        Unreachable: none of them is reachable.
     """
     flange_from_camera = session.mount(session.first(DeviceKind.CAMERA)).parent_from_child
     return go_to_first(session, (pose * flange_from_camera.inv() for pose in base_from_camera), name=name)
@@ -42,7 +42,7 @@ def go_to_first(
     """Drive the flange to the first of the poses that is reachable without collision; see `plan_to_first`.
 
     Raises:
-        Unreachable: none of them; says what is in the way of the last one.
+        Unreachable: none of them is reachable; the error names the obstacle of the last one.
         Cancelled: the task was cancelled meanwhile.
     """
     way = plan_to_first(
@@ -56,12 +56,12 @@ def go_to_first(
 
 
 def reachable(session: Session, base_from_flange: Sequence[RigidTransform]) -> list[int]:
-    """Return the indices of the poses in which the arm touches nothing; says nothing about the way there."""
+    """Return the indices of the poses in which the arm touches nothing; the path there is not checked."""
     return reachable_poses(skill_context(session), base_from_flange)
 
 
 def go_to_joints(session: Session, goal_rad: Array, *, name: str) -> bool:
-    """Drive to a joint vector; False when something is in the way, and nothing moved."""
+    """Drive to a joint vector; returns False, and moves nothing, when there is no free path."""
     way = plan_to_joints(skill_context(session), goal_rad, name=name)
     if way is not None:
         session.run(way)
@@ -69,17 +69,17 @@ def go_to_joints(session: Session, goal_rad: Array, *, name: str) -> bool:
 
 
 def park(session: Session) -> None:
-    """Back off from the panel if need be, then drive to the parking place of the cell file."""
+    """Move back from the panel if necessary, then drive to the parking position of the cell file."""
     park_arm(skill_context(session))
 
 
 def leave_the_panel(session: Session) -> None:
-    """Go away if the arm stands where the panel may be, as after a deed: with no belief no way can be planned there.
+    """Move away if the arm is where the panel may be, because no path can be planned there once its pose is unknown.
 
-    With a located panel it parks; otherwise, as after a restart in the middle of work, it backs off along the fingers.
+    With a located panel the arm parks; otherwise, for example after a restart, it moves back along the fingers.
 
     Raises:
-        Unreachable: it did not get away.
+        Unreachable: the arm did not get away.
     """
     context, room = skill_context(session), _where_the_panel_may_be(session)
     if stands_clear(context, room):
@@ -91,7 +91,7 @@ def leave_the_panel(session: Session) -> None:
 
 
 def skill_context(session: Session) -> SkillContext:
-    """What skills work with, from what is known now; an unlocated panel takes all the room that it may stand in."""
+    """Return the inputs of skills from the known facts; an unlocated panel blocks all the space where it may be."""
     file = session.cell.file
     return SkillContext(
         mover=session.mover,
@@ -110,7 +110,7 @@ def skill_context(session: Session) -> SkillContext:
 
 
 def kinematics(session: Session) -> Kinematics:
-    """The arm's kinematics, made once a cell."""
+    """Return the arm's kinematics, which are built once per cell."""
     connection = session.connection
     return session.world.kinematics(
         lambda: Kinematics.of(connection.device(session.first(DeviceKind.ARM)).capabilities())
@@ -118,7 +118,7 @@ def kinematics(session: Session) -> Kinematics:
 
 
 def lever_angles(session: Session) -> Mapping[str, float]:
-    """Angles of the levers and selectors whose state has been read."""
+    """Return the angles of the levers and selectors whose state has been read."""
     readings = session.world.readings
     return {
         name: angles[state]

@@ -1,4 +1,4 @@
-"""Base class of all emulators: one thread that receives requests, sends frames and damages them as its fault plan says."""
+"""Base class of all emulators: one thread receives requests, sends frames and injects faults."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ class WireEmulator:
         """Do the periodic work; called every `period_s`."""
 
     def status_frame(self) -> bytes | None:
-        """Return the device's error report, sent in place of a frame by the fault `status`; None if it has no such report."""
+        """Return the error report that the fault `status` sends in place of a frame; None if the device has none."""
         return None
 
     def unplug(self, *, away_s: float) -> None:
-        """Take the port away for `away_s` seconds and wait until it is back or the emulator is closed; any thread may call."""
+        """Remove the port for `away_s` seconds and wait until it is back or the emulator closed; for any thread."""
         if threading.current_thread() is self._thread:
             self._unplug_now(away_s)
             return

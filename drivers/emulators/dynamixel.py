@@ -149,7 +149,7 @@ class DynamixelEmulator(WireEmulator):
         self.send(None, protocol.encode(id_, protocol.STATUS, bytes([error]) + data), protected=slice(4, None))
 
     def _fast_answer(self, parameters: bytes) -> None:
-        """Answer a fast sync read: one packet for all servos, without byte stuffing, with a running CRC after each block."""
+        """Answer a fast sync read: one packet for all servos, not byte-stuffed, with a running CRC after each block."""
         address, length = struct.unpack_from("<HH", parameters)
         ids = [id_ for id_ in parameters[4:] if id_ in self.servos]
         if len(ids) != len(parameters) - 4:
@@ -189,7 +189,7 @@ class DynamixelEmulator(WireEmulator):
             servo.table[TICK : TICK + 2] = tick.to_bytes(2, "little")
 
     def _settle(self) -> None:
-        """Let the backing arm follow the goals while all servos have torque and no watchdog has tripped; else stop it."""
+        """Let the backing arm follow the goals while all servos have torque and no watchdog has tripped, or stop it."""
         is_on = all(s.table[TORQUE] and s.table[WATCHDOG] != 0xFF for s in self.servos.values())
         if is_on and not self._is_enabled:
             self._backing.enable(deadline=self.deadline())

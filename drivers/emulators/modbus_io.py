@@ -74,7 +74,7 @@ class IoTable:
         return points[address : address + count]
 
     def read_registers(self, function: int, address: int, count: int) -> Sequence[int]:
-        """Return registers: input 30h the DI word, input 10h and up the counters (high word first), holding 20h the DO word."""
+        """Return registers: input 30h DI word, input 10h and up counters (high word first), holding 20h DO word."""
         if (function, address, count) == (4, DI_WORD, 1):
             return [_word(self.inputs())]
         if (function, address, count) == (3, DO_WORD, 1):

@@ -26,7 +26,7 @@ class ModbusException(Exception):
 
 
 class RegisterMap(Protocol):
-    """Registers and bits of a Modbus device; each method raises `ModbusException` for an address that does not exist."""
+    """Registers and bits of a Modbus device; each method raises `ModbusException` for an unknown address."""
 
     def read_bits(self, function: int, address: int, count: int) -> Sequence[bool]:
         """Return coils (function 1) or discrete inputs (function 2)."""

@@ -1,4 +1,4 @@
-"""Ports of the emulators: a pty under a stable name, a TCP listener, a UDP socket; all reachable from this host only."""
+"""Ports of the emulators: a pty under a stable name, a TCP listener, a UDP socket; all for this host only."""
 
 from __future__ import annotations
 

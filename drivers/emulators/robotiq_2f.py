@@ -32,7 +32,7 @@ class Robotiq2FEmulatorOptions(FaultOptions):
 
 
 def min_force_n(backing: Gripper) -> float:
-    """Return the force that count 0 stands for, in newtons: the smallest force with which this gripper family closes."""
+    """Return the force of count 0 in newtons, which is the smallest with which this gripper family closes."""
     return min(MIN_FORCE_N, backing.capabilities().max_force_n)
 
 

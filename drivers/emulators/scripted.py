@@ -67,7 +67,7 @@ class Scripted:
 
 
 class ScriptedProximity(Scripted):
-    """Distance that rises from `first_m` by 1 mm per read and starts again after 1000 reads; or the constant `fixed_m`."""
+    """Distance that rises by 1 mm per read from `first_m` and restarts after 1000 reads, or the constant `fixed_m`."""
 
     kind = DeviceKind.PROXIMITY
 

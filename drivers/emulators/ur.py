@@ -1,7 +1,7 @@
 """Emulated Universal Robots controller on three TCP ports (RTDE, script, dashboard) that moves any arm.
 
-It understands only the URScript that the driver sends: `stopj`, and a program that servos to the joint positions in RTDE
-registers and ends when the heartbeat register no longer changes.
+It understands only the URScript that the driver sends: `stopj`, and a program that servos to the joint positions in
+RTDE registers and ends when the heartbeat register no longer changes.
 """
 
 from __future__ import annotations

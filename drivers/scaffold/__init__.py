@@ -1,7 +1,7 @@
 """Generates a new driver that runs at once: driver, emulator, test and documentation page, to be adapted to the device.
 
-The generated driver is for an invented device that streams frames `A5 5A counter values.. sum`, with values in thousandths
-of the SI unit. `panelwright new-driver` finds this module by the entry point `panelwright.scaffold`.
+The generated driver is for an invented device that streams frames `A5 5A counter values.. sum`, with values in
+thousandths of the SI unit. `panelwright new-driver` finds this module by the entry point `panelwright.scaffold`.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def new_driver(
 
     Args:
         name: module name: lower-case letters, digits and underscores.
-        package: name of a separate package, with the emulator beside the driver and a `pyproject.toml`; None for files in
-            this source tree.
+        package: name of a separate package, with the emulator beside the driver and a `pyproject.toml`; None for files
+            in this source tree.
 
     Raises:
         ConfigError: the name is not valid, or there is no template for the kind or the transport.

@@ -109,7 +109,7 @@ def cut_mean_square(e: Array, limit: float) -> float:
 
 @compiled
 def _is_near(kind: int, th: Array, samples: Array, perspective: bool) -> bool:
-    """Whether most samples lie within `NEAR_SIGMAS` of the surface."""
+    """Return whether most samples lie within `NEAR_SIGMAS` of the surface."""
     return bool(np.mean(residual_sizes(kind, th, samples, perspective) < NEAR_SIGMAS) > NEAR_SHARE)
 
 

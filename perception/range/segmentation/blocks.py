@@ -1,6 +1,7 @@
 """Mean depth of small blocks of pixels; of a block across a depth jump, only the side of its median counts.
 
-Blocks are processed in runs, in rows of one scratch array at fixed offsets and without a branch (`tangents` says why).
+Blocks are processed in runs of neighbours in a row. The quantities of a run are rows of one scratch array at fixed
+offsets, and the loops have no branch; the module `tangents` says why.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ from hal.arrays import Array, Labels
 from hal.jit import compiled
 
 JUMP_SLOPE = 2.5  # a surface seen steeper than 68 degrees counts as a jump between blocks
-BLOCK_SAMPLES = 4  # along a block; larger blocks are sampled
+BLOCK_SAMPLES = 4  # most samples along one side of a block; in larger blocks not every pixel is used
 MOST_SAMPLES = BLOCK_SAMPLES**2
-RUN = 128  # blocks at most
+RUN = 128  # largest number of blocks in a run
 MEDIAN, PER_Z, NEAR, FAST, SLOW, STEP = (row * RUN for row in range(6))  # where each row begins
 M, SU, SV, SQ = (row * RUN for row in range(6, 10))  # sums over the samples near the median
 SAMPLES = 10 * RUN
@@ -27,8 +28,8 @@ def mean_blocks(
 ) -> None:  # fmt: skip
     """Average blocks of b x b pixels of `depth` (H, W); writes rows [top, bottom) of (h, w) arrays as in `Grid`.
 
-    `count`: number of samples of a block whose distance from its median noise and slope allow. If that is less than
-    half, as where most readings are missing, `z` and `sigma` are NaN.
+    `count` becomes the number of a block's samples that are as near to its median as noise and slope allow. If these are
+    less than half, as where most readings are missing, `z` and `sigma` are NaN.
     """
     w = x.shape[1]
     hop = (b + BLOCK_SAMPLES - 1) // BLOCK_SAMPLES
@@ -48,7 +49,10 @@ def mean_blocks(
 
 @compiled
 def _load(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int, work: Array) -> None:
-    """Load the samples of `n` blocks, one row per position in the block; NaN beyond the image."""
+    """Load the samples of `n` blocks from block (r, start) on, one row per position in the block; NaN beyond the image.
+
+    `hop`: distance of neighbouring samples in pixels; `side`: number of samples along a block.
+    """
     H, W = depth.shape
     for i in range(side):
         row = depth[min(r * b + i * hop, H - 1)]
@@ -64,7 +68,7 @@ def _load(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int,
 
 @compiled
 def _medians(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int, work: Array, values: Array) -> None:
-    """Fill row MEDIAN: for whole blocks from the four corner samples, else from all samples of the block."""
+    """Fill row MEDIAN: for blocks that lie inside the image from their four corner samples, else from all their samples."""
     H, W = depth.shape
     if side == 1:
         for c in range(n):
@@ -78,7 +82,7 @@ def _medians(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: i
 
 @compiled
 def _medians_of_four(side: int, n: int, work: Array) -> None:
-    """Compute the lower medians of the corners of `n` whole blocks by a sorting network; missing readings sort last."""
+    """Compute the lower medians of the corner samples of `n` blocks by a sorting network; missing readings sort last."""
     at_q, at_s = SAMPLES + (side - 1) * RUN, SAMPLES + side * (side - 1) * RUN
     at_t = SAMPLES + (side * side - 1) * RUN
     for c in range(n):
@@ -94,9 +98,9 @@ def _medians_of_four(side: int, n: int, work: Array) -> None:
 
 @compiled
 def _median(side: int, c: int, work: Array, values: Array) -> float:
-    """Lower median of a block's samples; NaN if most are missing.
+    """Return the lower median of a block's samples; NaN if most are missing.
 
-    It is always a measured value, and not a mean of two values on either side of a jump.
+    The lower median is always a measured value, never a mean of two values on either side of a jump.
     """
     n = 0
     for m in range(side * side):
@@ -113,7 +117,7 @@ def _median(side: int, c: int, work: Array, values: Array) -> float:
 
 @compiled
 def _is_any_known(n: int, work: Array) -> bool:
-    """Whether any of the first `n` medians is a depth."""
+    """Return whether any of the first `n` medians is a depth."""
     known = False
     for c in range(n):
         known |= work[MEDIAN + c] == work[MEDIAN + c]
@@ -122,7 +126,7 @@ def _is_any_known(n: int, work: Array) -> bool:
 
 @compiled
 def _sums(sen: Array, noise: Array, b: int, hop: int, side: int, n: int, work: Array) -> None:
-    """Fill the rows of sums over the samples near the median of each block."""
+    """Fill the rows M, SU, SV and SQ, the sums over the samples near the median of each block."""
     perspective = sen[0] > 0
     _reach(noise, JUMP_SLOPE * 0.7 * b / sen[1], perspective, n, work)
     for k in range(side * side):
@@ -131,7 +135,10 @@ def _sums(sen: Array, noise: Array, b: int, hop: int, side: int, n: int, work: A
 
 @compiled
 def _reach(noise: Array, slope: float, perspective: bool, n: int, work: Array) -> None:
-    """Compute the variances of one pixel at the medians, and the largest distance of a near sample into row NEAR."""
+    """Fill the rows FAST, SLOW and STEP with variances of one pixel at the medians, and row NEAR with the limit of `_add`.
+
+    The limit is the largest distance of a sample from the median that noise and `slope` explain.
+    """
     for c in range(n):
         median = work[MEDIAN + c]
         z2 = median * median
@@ -146,8 +153,8 @@ def _reach(noise: Array, slope: float, perspective: bool, n: int, work: Array) -
 def _add(samples: Array, row: int, column: int, n: int, work: Array) -> None:
     """Add one sample of each block, at this row and column of the block, to the sums over samples near the median.
 
-    Planes are linear in 1 / z, so 1 / z is averaged, by its series: with q = d / median the sum is of d (1 - q + q^2),
-    which is median (1 - 1 / (1 + q)) up to third order.
+    Under perspective planes are linear in 1 / z, so 1 / z is averaged, by its series: with d the distance from the median
+    and q = d / median, the sum is of d (1 - q + q^2), which is median (1 - 1 / (1 + q)) up to third order.
     """
     u, v = float(column), float(row)
     for c in range(n):
@@ -162,7 +169,7 @@ def _add(samples: Array, row: int, column: int, n: int, work: Array) -> None:
 
 @compiled
 def _place(sen: Array, b: int, r: int, start: int, x: Array, y: Array, work: Array) -> None:
-    """Compute the mean ray coordinates of the samples near the median, or those of the block's centre without any."""
+    """Compute the mean ray coordinates of the samples near the median; those of the block's centre if there are none."""
     middle = 0.5 * (b - 1)
     for c in range(x.shape[0]):
         m = work[M + c]

@@ -11,17 +11,17 @@ from perception.range.segmentation.boundary_pixels import WORD, flagged
 from perception.range.segmentation.grid import sigma_at
 from perception.range.segmentation.pixel_assignment import bucket
 
-WIDEST_GAP_PX = 3  # most unlabelled pixels across a border: one block that no surface explained
-PAIR_POINTS = 24
+WIDEST_GAP_PX = 3  # most unlabelled pixels between touching labels: one block that no surface explained
+PAIR_POINTS = 24  # contacts of a pair that are returned, evenly spread over its border
 NONE_YET = as_numpy_scalar(0)
 
 
 @compiled
 def touching(labels: Labels, sen: Array) -> tuple[Labels, Indices, Array, Array]:
-    """Find the pairs of labels that touch.
+    """Find the pairs of labels that touch in an image (H, W) of labels.
 
-    `labels` (H, W), `sen` as `packed` of a sensor. Returns pairs (P, 2) of labels a < b, the number of contacts of each,
-    and ray coordinates x, y (P, PAIR_POINTS) of some contacts; the rest is unset for a pair with fewer contacts.
+    Returns the pairs (P, 2) of labels a < b; the number of contacts (P,) of each pair, which measures the length of their
+    border in pixels; and ray coordinates x, y (P, PAIR_POINTS) of some contacts, unset beyond the number of contacts.
     """
     ids, us, vs, pairs = _contacts(labels, WIDEST_GAP_PX)
     starts, order = bucket(ids, pairs.shape[0])
@@ -37,7 +37,7 @@ def touching(labels: Labels, sen: Array) -> tuple[Labels, Indices, Array, Array]
 
 @compiled
 def _contacts(labels: Labels, gap: int) -> tuple[Labels, Array, Array, Labels]:
-    """Find contacts of labels along rows and columns, across at most `gap` zeros, in raster order.
+    """Find where two labels meet along a row or a column, across at most `gap` unlabelled pixels, in raster order.
 
     Returns for each contact the number of its pair (from 1) and its column and row; and the pairs (P, 2), a < b, in
     order of their first contact.
@@ -71,7 +71,11 @@ def _add_contacts(
     row: Labels, v: int, ends: Labels, gap: int, above: Labels, above_at: Labels, newest: Labels, pairs: Labels,
     older: Labels, count: int, ids: Labels, us: Array, vs: Array, n: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Append the contacts of row v in the columns `ends` to the `n` contacts and `count` pairs; returns both numbers."""
+    """Append the contacts of row v in the columns `ends` to the `n` contacts and `count` pairs; returns both new numbers.
+
+    `above` and `above_at` hold the last label above each column and its row; `newest` and `older` are the linked lists of
+    the pairs.
+    """
     for at in range(ends.shape[0]):
         u = ends[at]
         label, left_at = row[u], u - 1
@@ -101,7 +105,7 @@ def _add_contacts(
 
 @compiled
 def _flag_ends(row: Labels, above: Labels, flags: Mask) -> None:
-    """Flag labelled pixels whose label differs from that of the pixel to the left or of the last labelled one above."""
+    """Flag labelled pixels whose label differs from that of the pixel to the left or of the last labelled pixel above."""
     flags[0] = row[0] > 0
     for u in range(1, row.shape[0]):
         flags[u] = (row[u] > 0) & ((row[u] != row[u - 1]) | (row[u] != above[u]))
@@ -121,7 +125,7 @@ def _pass_row(row: Labels, v: int, above: Labels, above_at: Labels) -> None:
 def step_and_turn(
     kind_a: int, a: Array, kind_b: int, b: Array, x: Array, y: Array, noise: Array, perspective: bool,
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the median step in sigmas and the median angle in radians between two surfaces at the rays (x, y).
+    """Return the median depth step in sigmas and the median angle in radians between two surfaces at the rays (x, y).
 
     A ray that misses one of the surfaces counts as an infinite step; the angle uses only rays that hit both.
     """

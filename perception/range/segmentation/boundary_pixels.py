@@ -1,4 +1,4 @@
-"""Search for the pixels beside another surface than their own; only their labels may need to change."""
+"""Search for the pixels that have a neighbour with another label; only their labels may need to change."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hal.arrays import Labels, Mask
 from hal.jit import compiled
 
-WORD = 8  # flags that are tested together
+WORD = 8  # flags per 64-bit word, which are tested together
 
 
 @compiled
@@ -67,7 +67,8 @@ def _flag_contested(own: Labels, least: NDArray[np.uint32], most: Labels, newest
 def flagged(words: NDArray[np.uint64], places: Labels) -> int:
     """Write the indices of the flags set in `words`, ascending, into `places`; returns their number.
 
-    `places` needs room for one more. Flags are tested eight at a time, because few are set.
+    `words` are flags of one byte each, seen as 64-bit numbers: eight are tested at a time, because few are set. `places`
+    needs room for one more index than there are flags set.
     """
     flags = words.view(np.bool_)
     n = 0
@@ -89,7 +90,7 @@ def flag_free(labels: Labels, flags: Mask) -> None:
 
 @compiled
 def pixels_around(rows: Labels, columns: Labels, reach: int, shape: tuple[int, int]) -> tuple[Labels, Labels]:
-    """Return each pixel within `reach` rows and columns of a given one, once, for an image of the given shape."""
+    """Return rows and columns of all pixels within `reach` rows and columns of the given ones, each pixel once."""
     H, W = shape
     seen = np.zeros((H, W), np.bool_)
     side = 2 * reach + 1

@@ -24,20 +24,21 @@ Labels = NDArray[np.int32]
 
 NARROWER = 0.6  # largest ratio of a strip's width to that of the face beside it
 LONG = 22.0  # least elongation as `_shapes` measures it; about three times as long as wide
-STEP_SIGMAS = 3.0
+STEP_SIGMAS = 3.0  # largest step between a strip and a face that it continues
 TURN_RAD = 1.0  # a surface fitted to several rounded edges may meet its faces at any angle below a right angle
-FLAT_TURN_RAD = 0.5
-NARROW, NARROW_SIGMAS = 0.004, 4.0  # half width, in shorter image sides, below which a strip's own shape is unknown
-GENTLE_RAD = 0.7
-NEAR_SHARE = 0.5  # of the strip's width; largest distance of its pixels from a face
-LEAST_SHARE = 0.4  # of a strip between faces must be so near; low, because connected edges may include thin faces
-WHOLE_SHARE = 0.7  # the same for a strip beside one face
+FLAT_TURN_RAD = 0.5  # a flat strip at a larger angle to its face is a bevel
+# Half width, as a ratio of the image's shorter side, below which a strip's own shape is unknown; the step then accepted.
+NARROW, NARROW_SIGMAS = 0.004, 4.0
+GENTLE_RAD = 0.7  # a strip that touches only one face must meet it at a smaller angle
+NEAR_SHARE = 0.5  # largest distance of a strip's pixels from a face, as a ratio of the strip's width
+LEAST_SHARE = 0.4  # least share of a strip's pixels that are so near; low, because connected edges may hold thin faces
+WHOLE_SHARE = 0.7  # the same for a strip beside only one face
 LEAST_BORDER_PX = 6
-ALONG_SHARE = 0.15  # of a strip's rim; if less borders a face, the strip touches it only with its end
-REACH = 0.025  # of the image's shorter side, over which unlabelled pixels beside a face may curve away from it
+ALONG_SHARE = 0.15  # least share of a strip's rim that borders a face; with less, only its end touches the face
+REACH = 0.025  # of the image's shorter side: how far unlabelled pixels beside a face may curve away from it
 LEAST_ROWS = 192  # in smaller images the pixels beside a face are mixed pixels of an outline, which matching needs
 SLOPE = 0.5  # largest slope of that curve
-SIGMAS = 3.0
+SIGMAS = 3.0  # allowance for noise in the distance of a pixel from a face
 
 
 def without_fillets(
@@ -94,7 +95,10 @@ def _continuations(
     depth: Array, sen: Array, noise: Array, labels: Labels, kinds: Indices, table: Array, half_width: Array,
     length: Array, pairs: Labels, lengths: Indices, x: Array, y: Array,
 ) -> tuple[Mask, Mask]:  # fmt: skip
-    """Return in which touching pairs the narrower label continues the wider one as a strip, and which strips are gentle."""
+    """Return for each touching pair whether the narrower label is a strip that continues the wider one.
+
+    Also returns which labels are gentle strips: they meet a face at less than `GENTLE_RAD`.
+    """
     narrow_px = NARROW * min(labels.shape[0], labels.shape[1])
     out, is_gentle = np.zeros(pairs.shape[0], np.bool_), np.zeros(kinds.shape[0], np.bool_)
     for p in range(pairs.shape[0]):
@@ -121,7 +125,7 @@ def _continuations(
 
 @compiled
 def _goes_on(step: float, turn: float, is_flat: bool, is_narrow: bool) -> bool:
-    """Whether a strip continues a face; `step` in sigmas, `turn` in rad. A flat strip at a larger angle is a bevel."""
+    """Return whether a strip continues a face; `step` between them in sigmas, `turn` in radians."""
     if is_narrow:
         return step <= NARROW_SIGMAS and turn <= TURN_RAD
     return step <= STEP_SIGMAS and turn <= (FLAT_TURN_RAD if is_flat else TURN_RAD)
@@ -163,7 +167,10 @@ def _flag_rims(above_2: Labels, above: Labels, own: Labels, below: Labels, below
 
 @compiled
 def _flag_sides(own: Labels, flags: Mask) -> None:
-    """Also flag those with two successive pixels of another label to the left or right; end pixels are repeated."""
+    """Flag also the labelled pixels with two successive pixels of another label to the left or right.
+
+    Beyond either end of the row its last pixel counts as repeated.
+    """
     last = own.shape[0] - 1
     for u in range(last - 3):
         k = own[u + 2]
@@ -178,7 +185,7 @@ def _flag_sides(own: Labels, flags: Mask) -> None:
 
 @compiled
 def _off(kind: int, th: Array, x: float, y: float, z: float, perspective: bool) -> float:
-    """Distance of a pixel from a surface along the normal, metres; infinite if its ray misses."""
+    """Return the distance in metres of a pixel from a surface, along the normal; infinite if its ray misses."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return np.inf
@@ -190,7 +197,10 @@ def _off(kind: int, th: Array, x: float, y: float, z: float, perspective: bool) 
 def _nearer(
     depth: Array, sen: Array, indices: Labels, half_width: float, faces: Indices, kinds: Indices, table: Array,
 ) -> Labels:  # fmt: skip
-    """Return the nearest face of each pixel; 0 if it is farther away than the width of the strip allows."""
+    """Return the label of the nearest face for each pixel of a strip; 0 if even that is farther than `NEAR_SHARE` allows.
+
+    `indices` (N,): the strip's flat pixel indices. `half_width` is in pixels; `faces` are labels.
+    """
     W = depth.shape[1]
     perspective = sen[0] > 0
     owner = np.zeros(indices.shape[0], np.int32)
@@ -251,7 +261,7 @@ def _flag_outlines(above: Labels, own: Labels, below: Labels, flags: Mask) -> No
 
 @compiled
 def _next_ring(ring: Labels, shape: tuple[int, int], fd: Array, flat: Labels) -> Labels:
-    """Return the free pixels with a reading beside those of a ring; marks them -1 in `flat`, so that each occurs once."""
+    """Return the unlabelled pixels with a reading beside those of a ring; marks them -1 in `flat`, so that none occurs twice."""
     H, W = shape
     new, count = np.empty(4 * ring.shape[0], np.int32), 0
     for i in ring:
@@ -269,7 +279,10 @@ def _next_ring(ring: Labels, shape: tuple[int, int], fd: Array, flat: Labels) ->
 def _slowest_left(
     i: int, W: int, fd: Array, sen: Array, noise: Array, flat: Labels, kinds: Indices, table: Array, slope: float,
 ) -> int:  # fmt: skip
-    """Return the nearest of the surfaces beside pixel i; 0 if all are farther away than noise and `slope` allow."""
+    """Return the nearest of the surfaces that own a pixel beside pixel i; 0 if all are farther than noise and `slope` allow.
+
+    `slope`: distance allowed in addition to noise, metres (per metre of depth, if perspective).
+    """
     perspective = sen[0] > 0
     x, y, z = (i % W - sen[3]) / sen[1], (i // W - sen[4]) / sen[2], fd[i]
     best, label = SIGMAS * sigma_at(noise, z) + slope * (z if perspective else 1.0), 0

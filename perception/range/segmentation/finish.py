@@ -31,10 +31,10 @@ from perception.range.segmentation.run_length import pixels_of
 Labels = NDArray[np.int32]
 
 COARSE_SAMPLES = 300  # after a fit to these, one step on all pixels is enough
-NAMING_SAMPLES = 150
+NAMING_SAMPLES = 150  # samples that decide whether a surface is reported as a simpler kind
 MIDDLE_STRIDE = 4  # every fourth of the coarse samples is used for the medians
 SLOW_NOISE_AREA_PX = 150.0  # pixels that share one value of the slow noise; limits the gain of averaging
-STEP_AREA_PX = 16.0
+STEP_AREA_PX = 16.0  # the same for quantisation steps
 NO_SHIFT = 1e-9  # pixels; makes positions robust to rounding just below a whole number
 FARTHEST_SIGMAS = 50.0  # largest displacement of a surface by the last step
 ROUNDS = as_numpy_scalar(1)  # of robust weights
@@ -44,9 +44,14 @@ FREE = np.zeros(9, np.bool_)
 class Refinement(NamedTuple):
     """Result of the final fit of one region.
 
-    Frame (2, 3) of tilts; parameters; information matrix (9, 9); its inverse (p, p) over the free parameters, NaN if
-    they are not all determined; medians (4,) of x, y, z and sigma; sum of squared residuals of the kept pixels; number
-    of pixels kept.
+    Attributes:
+        frame: (2, 3) tangent vectors in which tilts are expressed.
+        parameters: (16,) of the surface.
+        information: (9, 9) matrix over the tangent parameters.
+        inverse: (p, p) of `information` over the free parameters; NaN if they are not all determined.
+        middles: (4,) medians of x, y, z and sigma.
+        squares: sum of the squared residuals of the kept pixels, in squared sigmas.
+        kept: number of pixels within the trim.
     """
 
     frame: Array
@@ -68,11 +73,13 @@ def refine_surface(
     noise: NoiseModel,
     fixed: NDArray[np.bool_] = FREE,
 ) -> tuple[Surface, Array]:
-    """Fit a surface to the depths of all its pixels; returns the surface and its parameters.
+    """Fit a surface to the depths of all its pixels; returns the surface and its parameters (16,).
 
     Args:
-        own: the label of those pixels in `regions`.
-        fixed: (9,) tangent parameters that stay at their prior value.
+        label: label of the returned surface.
+        kind, th: kind and initial parameters.
+        own: label of its pixels in `regions`.
+        fixed: (9,) which tangent parameters keep their initial value.
     """
     n = int(regions.sizes[own])
     th, H, inverse, middles, squares, kept = refined(
@@ -88,8 +95,9 @@ def refine_surfaces(
 ) -> tuple[list[Surface], list[int], Array]:
     """Apply `refine_surface` to the regions with labels `owns`, which become labels 1 to M.
 
-    A surface that only sensor errors make curved is reported as the simpler kind. Pixels are still assigned by the
-    curved one, so its kinds (M,) and parameters (M, 16) are returned as well, second and third.
+    A surface that only sensor errors make curved is reported as the simpler kind, such as a plane. Pixels are still
+    assigned by the curved surface, so the kinds (M,) and parameters (M, 16) of the curved ones are returned after the
+    surfaces.
     """
     if not owns:
         return [], [], np.zeros((0, SIZE))
@@ -126,6 +134,7 @@ def _surface(
     perspective: bool,
     fixed: NDArray[np.bool_],
 ) -> Surface:
+    """Build the surface that is reported for a region from its final fit; scales the covariance by the residuals."""
     frame, th, H, inverse, middles, squares, kept = refinement
     misfit = sqrt(squares / max(kept - int(FREEDOM[kind]), 1))
     x, y, depth, sigma = middles.tolist()
@@ -151,7 +160,9 @@ def _surface(
 def refined(
     kind: int, th: Array, depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, fixed: Mask,
 ) -> tuple[Array, Array, Array, Array, float, int]:  # fmt: skip
-    """Fit a surface to the `pixels` of runs (R, 3): robustly on an evenly spread sample, then one step on all.
+    """Fit a surface to the pixels of the runs (R, 3): robustly to an evenly spread sample, then with one step on all.
+
+    `pixels` is the number of pixels in the runs, `th` the initial parameters and `fixed` (9,) which of them stay.
 
     Returns:
         the fields of `Refinement` except the frame.
@@ -166,7 +177,8 @@ def refined(
         middles[a] = np.median(few[a, ::MIDDLE_STRIDE].copy())
     start = th
     th, H, kept, used = last_step(kind, start, depth, sen, noise, runs, fixed)
-    # On a nearly flat face the step may pass through zero curvature and put the surface on the other side of the sensor.
+    # On a nearly flat face the step may pass through zero curvature and move the surface behind the sensor. A step
+    # that displaces the middle of the region too far is therefore rejected.
     before = depth_on(kind, start, middles[0], middles[1], sen[0] > 0)
     after = depth_on(kind, th, middles[0], middles[1], sen[0] > 0)
     if np.isfinite(before) and not abs(after - before) < FARTHEST_SIGMAS * middles[3]:
@@ -176,7 +188,7 @@ def refined(
 
 @compiled
 def _inverse(H: Array, p: int, fixed: Mask) -> Array:
-    """Return the inverse (p, p) over the free parameters, zero elsewhere; NaN if they are not all determined."""
+    """Return the inverse (p, p) of `H` over the free parameters, zero elsewhere; NaN if they are not all determined."""
     A, b, out, scale = np.empty((p, p)), np.empty(p), np.zeros((p, p)), np.empty(p)
     for i in range(p):
         scale[i] = 1.0 / np.sqrt(max(H[i, i], 1e-300))
@@ -206,7 +218,10 @@ def without_crumbs(labels: Labels, surfaces: list[Surface], least: float) -> tup
 
 
 def averaging_loss(noise: NoiseModel, depth_m: float) -> float:
-    """Factor (>= 1) by which a parameter's variance exceeds that for white noise of the same size."""
+    """Return the factor (>= 1) by which a parameter's variance exceeds its value for white noise of the same size.
+
+    Neighbouring pixels share slow noise and quantisation steps, so averaging over them reduces these errors less.
+    """
     z2 = depth_m * depth_m
     white = (noise.white[0] + noise.white[1] * z2) ** 2
     slow = (noise.correlated[0] + noise.correlated[1] * z2) ** 2
@@ -217,7 +232,7 @@ def averaging_loss(noise: NoiseModel, depth_m: float) -> float:
 
 
 def _pseudo_inverse(H: Array, kind: int, fixed: NDArray[np.bool_]) -> Array:
-    """Return the pseudo-inverse (p, p) of a singular information matrix: the variances of determined directions."""
+    """Return the pseudo-inverse (p, p) of a singular information matrix: the covariance of the determined directions."""
     p = int(FREEDOM[kind])
     free = np.flatnonzero(~fixed[:p])
     out = np.zeros((p, p))

@@ -11,10 +11,10 @@ from hal.arrays import Array, Labels
 from hal.jit import as_numpy_scalar, compiled
 from perception.range.fitting.initialisation import solve_positive
 
-BEND_RMS = 0.4  # sigmas; a larger gain of a quadratic over a plane means that the blocks are curved
-BEND_F = 4.0  # F ratio that this gain must also exceed to be significant
+BEND_RMS = 0.4  # sigmas; blocks are curved if a quadratic reduces the mean squared residual by more than its square
+BEND_F = 4.0  # F ratio that this reduction must also exceed to be significant
 WORST_MEAN_SQUARE = 3.0  # squared sigmas; blocks with a larger mean square about their plane are not planar
-OF_PLANE, OF_BENT = as_numpy_scalar(3), as_numpy_scalar(6)  # coefficients of g over x and y
+OF_PLANE, OF_BENT = as_numpy_scalar(3), as_numpy_scalar(6)  # number of coefficients of a plane and of a quadratic
 # Index of each product of two of 1, p, q, pp, pq, qq in the list of moments
 # 1, p, q, pp, pq, qq, ppp, ppq, pqq, qqq, pppp, pppq, ppqq, pqqq, qqqq.
 MOMENTS = np.array(
@@ -31,7 +31,10 @@ MOMENTS = np.array(
 
 @compiled
 def solve3(S: Array, out: Array) -> bool:
-    """Solve for (a, b, c) of g = a x + b y + c from sums (n, x, y, xx, xy, yy, g, xg, yg); False if degenerate."""
+    """Solve g = a x + b y + c for (a, b, c) by least squares; returns False if the blocks do not determine a plane.
+
+    `S` (9,) are the weighted sums of 1, x, y, xx, xy, yy, g, xg and yg over the blocks.
+    """
     n = S[0]
     if n <= 0.0:
         return False
@@ -49,7 +52,7 @@ def solve3(S: Array, out: Array) -> bool:
 
 @compiled
 def plane_from_coefficients(m: Array, perspective: bool, th: Array) -> None:
-    """Write the PLANE parameters, normal towards the sensor, of g = a x + b y + c into `th`."""
+    """Write the PLANE parameters of g = m . (x, y, 1), with the normal towards the sensor, into `th` (16,)."""
     if perspective:
         nx, ny, nz, d = m[0], m[1], m[2], 1.0  # (a, b, c) . X = 1 and z > 0: this normal points away
     else:
@@ -60,7 +63,10 @@ def plane_from_coefficients(m: Array, perspective: bool, th: Array) -> None:
 
 @compiled
 def moved_rms(a: float, b: float, c: float, S: Array, count: int) -> float:
-    """Root mean square of a x + b y + c over `count` blocks with sums `S`, in sigmas."""
+    """Return the root mean square of a x + b y + c in sigmas over `count` blocks with the sums `S` of `solve3`.
+
+    With the differences of two planes' coefficients it is how far one plane lies from the other.
+    """
     n, x, y = S[0], S[1] / S[0], S[2] / S[0]
     xx, xy, yy = S[3] / n - x * x, S[4] / n - x * y, S[5] / n - y * y
     square = (a * x + b * y + c) ** 2 + a * a * xx + 2.0 * a * b * xy + b * b * yy
@@ -69,9 +75,10 @@ def moved_rms(a: float, b: float, c: float, S: Array, count: int) -> float:
 
 @compiled
 def squares_left(idx: Labels, count: int, table: Array, x0: float, y0: float, scale: float) -> tuple[float, float]:
-    """Return the residual sums of squares (in sigmas) of a plane and of a quadratic fitted to the blocks idx[:count].
+    """Return the residual sums of squares, in squared sigmas, of a plane and of a quadratic fitted to some blocks.
 
-    `table` is that of `grow_planes`.
+    The blocks are the rows idx[:count] of the `table` of `grow_planes`. For accuracy, coordinates are shifted by x0, y0
+    and divided by `scale`.
     """
     M, b, total = np.zeros(15), np.zeros(6), 0.0
     g0, per = table[idx[0], 2], 1.0 / scale
@@ -103,7 +110,7 @@ def squares_left(idx: Labels, count: int, table: Array, x0: float, y0: float, sc
 
 @compiled
 def is_bent(flat: float, quadratic: float, count: int) -> bool:
-    """Whether `count` blocks are not planar, from the residual sums of squares of a plane and of a quadratic."""
+    """Return whether `count` blocks are not planar, from the residual sums of squares of a plane and of a quadratic."""
     ratio = (flat - quadratic) / 3.0 / max(quadratic / max(count - 6, 1), 0.3)
     is_better = flat - quadratic > BEND_RMS * BEND_RMS * count and ratio > BEND_F
     return is_better or flat > WORST_MEAN_SQUARE * count

@@ -24,18 +24,26 @@ from perception.range.tiles import for_each_tile
 Ints = NDArray[np.int32]
 
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
-WIDEST_RADIUS = 3
-LARGE_SIDE_PX = 1024
-MIDDLE_SAMPLES = as_numpy_scalar(1024)
+WIDEST_RADIUS = 3  # blocks
+LARGE_SIDE_PX = 1024  # shorter side of an image from which the size of blocks grows with the image
+MIDDLE_SAMPLES = as_numpy_scalar(1024)  # depths from which the median is estimated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Grid:
-    """Blocks of an image, (h, w) arrays; NaN depth marks an empty block.
+    """Blocks of an image and their tangent planes, as (h, w) arrays; NaN depth marks an empty block.
 
-    `x`, `y` are coordinates on the plane z = 1 (pinhole) or metres (orthographic), `z` metres over `count` samples,
-    `sigma` the standard deviation of `z`, `normal` (h, w, 3) towards the sensor, `rms` the residual of the tangent
-    plane in sigmas, `slow_share` the part of the variance that neighbours share.
+    Attributes:
+        size_px: side of a block.
+        radius: radius in blocks of the window to which each tangent plane is fitted.
+        perspective: whether the sensor is a pinhole.
+        x, y: mean ray coordinates, on the plane z = 1 (pinhole) or in metres (orthographic).
+        z, sigma: mean depth and its standard deviation, metres.
+        count: number of samples averaged.
+        normal: (h, w, 3) unit normal of the tangent plane, towards the sensor.
+        rms: root mean square residual of the tangent plane, in sigmas.
+        normal_sigma_rad: expected standard deviation of the normals.
+        slow_share: share of a pixel's variance that neighbouring pixels have in common, 0 to 1.
     """
 
     size_px: int
@@ -69,9 +77,10 @@ def block_size(shape: tuple[int, int], noise: NoiseModel, sensor: RangeSensorMod
 
 
 def slope_sigma_rad(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, *, side_px: int) -> float:
-    """Standard deviation of the slope of a plane fitted to a square window.
+    """Return the standard deviation of the slope of a plane fitted to a square window of the given side.
 
-    It is sigma / (pitch sqrt(sum u^2)) for white noise, plus a part for slow noise and quantisation steps.
+    White noise contributes sigma / (pitch sqrt(sum u^2)), with u the pixel offsets from the centre; slow noise and
+    quantisation steps are added.
     """
     pitch = sensor.pitch_m(depth_m)
     slow = noise.correlated[0] + noise.correlated[1] * depth_m**2
@@ -92,10 +101,13 @@ def build_grid(
     tiles: int = 1,
     pool: ThreadPoolExecutor | None = None,
 ) -> Grid:
-    """Build blocks of `size_px` pixels of an (H, W) depth image and their tangent planes; noise sets the window radius.
+    """Divide an (H, W) depth image into blocks of `size_px` pixels and fit a tangent plane to each.
 
-    Neighbours with a slope above `jump_slope` (metres of depth per metre across) are separate. `corner_px`: row and
-    column of the sensor at which the image begins, for a part of a larger one.
+    Args:
+        noise: sets the standard deviations, and the radius of the windows of the tangent planes.
+        jump_slope: largest slope between neighbouring blocks of one surface, metres of depth per metre across.
+        corner_px: row and column in the sensor's image at which `depth_m` begins, if it is only a part of that image.
+        tiles, pool: number of parts computed in parallel, and the threads that compute them.
     """
     packed = seen_from(sensor, corner_px)
     law = noise.packed()
@@ -133,7 +145,7 @@ def build_grid(
 
 
 def seen_from(sensor: RangeSensorModel, corner_px: tuple[int, int]) -> Array:
-    """Return the packed sensor (5,) of the part of its image that begins at row and column `corner_px`."""
+    """Return the packed sensor (5,) for the part of its image that begins at row and column `corner_px`."""
     packed = sensor.packed()
     packed[3] -= corner_px[1]
     packed[4] -= corner_px[0]
@@ -152,7 +164,7 @@ def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px
 
 @compiled
 def _middle_depth(z: Array) -> float:
-    """Median of a sample of the known depths; 1 if there are none."""
+    """Return the median of a sample of the known depths in metres; 1 if there are none."""
     known = valid_sample(z, MIDDLE_SAMPLES)
     return np.median(known) if known.shape[0] > 0 else 1.0
 

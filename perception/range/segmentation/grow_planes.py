@@ -1,6 +1,6 @@
-"""Planes grown over the grid from flat seeds.
+"""Region growing of planes over the grid, from seeds in flat neighbourhoods.
 
-A plane grows as long as its own model explains the next block, so it stops at a crease however gradually the normals
+A plane grows as long as its own equation explains the next block, so it stops at a crease however gradually the normals
 change there. A plane that grew on a curved surface is rejected, because a quadratic explains its blocks clearly better.
 """
 
@@ -20,8 +20,8 @@ SAME_PLANE = 0.1  # sigmas; sweeps end when the plane moves by less, as it then 
 MOST_PLANES = 512
 LOOSE_NORMAL = 0.5  # stored length of a normal that may seed a plane but is too noisy to be compared with one
 EMPTY = as_numpy_scalar(0)
-TAKEN = np.int32(2**31 - 1)
-BENT = np.int32(-1)  # a block from which no plane grows
+TAKEN = np.int32(2**31 - 1)  # mark of a block that belongs to a plane, or is not free
+BENT = np.int32(-1)  # owner of a block from which no plane grows, because it is curved
 
 
 @compiled
@@ -29,10 +29,13 @@ def grow_planes(
     x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask, label: Labels, first_label: int,
     perspective: bool, order: Labels, least: int, cos_limit: float, tried: Mask,
 ) -> tuple[Array, Indices, Array]:  # fmt: skip
-    """Grow planes over the free blocks; writes their labels.
+    """Grow planes over the free blocks; writes their labels, from `first_label` on, into `label` and updates `free`.
 
-    Returns parameters (M, 16), block counts (M,) and mean squared residuals (M,).
-    Blocks of planes that were rejected as curved are marked in `tried`, so that they are not used as seeds again.
+    `x` to `rms` are the arrays of `Grid`. `order`: flat indices of the seeds, the best first. A plane needs `least` blocks,
+    and the normals of its blocks differ from its own by an angle whose cosine is at least `cos_limit`. Blocks of planes
+    that were rejected as curved are marked in `tried`.
+
+    Returns parameters (M, 16), numbers of blocks (M,) and mean squared residuals (M,) of the planes.
     """
     h, w = z.shape
     table, mark, place = _padded(x, y, z, sigma, normal, rms, free, perspective)
@@ -102,8 +105,8 @@ def _padded(
 ) -> tuple[Array, Labels, Labels]:  # fmt: skip
     """Copy the blocks into a table with a margin of taken ones, so that growing needs no test for the image border.
 
-    Returns (N, 8) x, y, g, weight of g, normal (0 if unknown), z; marks (N,), `TAKEN` where a block is not free; and
-    the row of the table for each block (h w,).
+    Returns the table (N, 8) of x, y, g (1 / z or z), weight of g, normal (0 if unknown) and z; the marks (N,), `TAKEN`
+    where a block is not free; and the row of the table for each block (h w,).
     """
     h, w = z.shape
     across = w + 2
@@ -130,7 +133,7 @@ def _padded(
 
 @compiled
 def _tangent(block: Array, perspective: bool, m: Array) -> bool:
-    """Write the coefficients of a block's tangent plane into `m`; False if the plane contains the ray."""
+    """Write the coefficients of a block's tangent plane into `m` (3,); returns False if the plane contains the ray."""
     x, y, nx, ny, nz = block[0], block[1], block[4], block[5], block[6]
     if perspective:
         d = (nx * x + ny * y + nz) * block[7]
@@ -145,7 +148,7 @@ def _tangent(block: Array, perspective: bool, m: Array) -> bool:
 
 @compiled
 def _add_block(block: Array, S: Array) -> None:
-    """Add one row of the table to the sums that `solve3` reads."""
+    """Add one row of the table to the weighted sums `S` (9,) that `solve3` reads."""
     x, y, g, weight = block[0], block[1], block[2], block[3]
     wx, wy = weight * x, weight * y
     S[0] += weight
@@ -161,7 +164,7 @@ def _add_block(block: Array, S: Array) -> None:
 
 @compiled
 def _fits(block: Array, a: float, b: float, c: float, th: Array, limit: float, cos_limit: float) -> bool:
-    """Whether the plane g = a x + b y + c (`th`) explains a block, and the block's normal, if steady, agrees."""
+    """Return whether the plane g = a x + b y + c (`th`) explains a block, and the block's normal, if steady, agrees."""
     e = block[2] - a * block[0] - b * block[1] - c
     nx, ny, nz = block[4], block[5], block[6]
     turn = th[0] * nx + th[1] * ny + th[2] * nz
@@ -238,7 +241,10 @@ def _span(
     table: Array, mark: Labels, at: int, stamp: int, m: Array, th: Array, cos_limit: float, queue: Labels, count: int,
     span: Labels, S: Array,
 ) -> int:  # fmt: skip
-    """Append the explained blocks of one row around block `at` to `queue`; their range [first, end) goes to `span`."""
+    """Append the explained blocks of the row on both sides of block `at` to `queue`; writes their range into `span`.
+
+    The range is [first, end). Also adds the blocks to the sums `S`; returns the new length of `queue`.
+    """
     a, b, c, limit = m[0], m[1], m[2], GROW_SIGMAS * GROW_SIGMAS
     for step in (-1, 1):
         j = at + step

@@ -1,4 +1,4 @@
-"""Growing a surface of any kind over the grid: the blocks connected to given ones that it explains."""
+"""Region growing of a surface of any kind over the grid: the blocks connected to given ones that it explains."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ def grow_surface(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask,
     seeds: Indices, perspective: bool, cos_limit: float, mark: Image, stamp: int, queue: Indices,
 ) -> tuple[int, float]:  # fmt: skip
-    """Collect the blocks connected to `seeds` that the surface explains into `queue`; returns their number.
+    """Collect the blocks connected to `seeds` that the surface explains into `queue`.
 
-    Also returns the sum of squared residuals. `mark` receives `stamp` for each of these blocks.
+    Returns their number and the sum of their squared residuals, in squared sigmas. `x` to `rms` are the arrays of `Grid`;
+    only blocks that are `free` count. `mark` receives `stamp` for each collected block.
     """
     h, w = z.shape
     fx, fy, fz, fs = x.ravel(), y.ravel(), z.ravel(), sigma.ravel()
@@ -61,7 +62,7 @@ def _explained(
     kind: int, th: Array, x: float, y: float, z: float, sigma: float, normals: Array, j: int, rms: float,
     perspective: bool, cos_limit: float,
 ) -> float:  # fmt: skip
-    """Return the squared residual in sigmas, reduced at grazing rays, if the surface explains block j, else -1."""
+    """Return the squared residual of block j in squared sigmas, reduced at grazing rays; -1 if the surface fails there."""
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return -1.0

@@ -1,4 +1,4 @@
-"""Assignment of pixels that several surfaces explain about equally, by their neighbours' labels.
+"""Assignment of pixels that several surfaces explain about equally well, by the labels of their neighbours.
 
 Near a crease, and on the ring where a wrong plane intersects a sphere, the depth of one pixel cannot tell two surfaces
 apart, least of all under slow noise, which neighbouring pixels share. Therefore the residual of a pixel is combined
@@ -16,12 +16,12 @@ from perception.range.segmentation.pixel_assignment import ASSIGNMENT_SIGMAS, PL
 
 REACH_PX = 2  # neighbours of 5 x 5
 SIDE_PX = 2 * REACH_PX + 1
-OWN = SIDE_PX * SIDE_PX // 2  # index of the pixel itself in the patch
-PATCH = 32  # size of the patch in row order, padded with zeros to whole vectors
+OWN = SIDE_PX * SIDE_PX // 2  # index of the pixel itself in the patch, the labels around it in row order
+PATCH = 32  # size of the patch, padded with zeros so that it fills whole vector registers
 SHARED_PX = 25.0  # pixels that share one value of the slow noise
 NEIGHBOUR_WEIGHT = 3.0  # cost, as half a squared residual, of a label that no neighbour has
 TOP_LABEL = np.int32(2**31 - 1)
-SAFE_NEIGHBOURS = 5  # of eight, as at a straight border; a pixel with so many equal neighbours that fits well stays
+SAFE_NEIGHBOURS = 5  # of eight, as at a straight border: a well explained pixel with so many keeps its label
 
 
 @compiled
@@ -31,7 +31,9 @@ def icm_sweep(
 ) -> None:  # fmt: skip
     """Compute new labels of the pixels at `rows`, `columns` (N,) of `labels` (H, W); writes out[first:last].
 
-    A pixel without a neighbour of another label keeps its own.
+    Each pixel gets the label of least cost among those in the 5 x 5 pixels around it. The cost is half the squared
+    residual, divided by the number of pixels that share their noise, plus `NEIGHBOUR_WEIGHT` times the share of the
+    labelled neighbours with another label. A pixel without a neighbour of another label keeps its own.
     """
     patch = np.zeros(PATCH, np.int32)
     perspective, per_x, per_y = sen[0] > 0, 1.0 / sen[1], 1.0 / sen[2]
@@ -105,7 +107,7 @@ def _count(patch: Labels, label: np.int32) -> int:
 
 @compiled
 def _largest_below(patch: Labels, own: np.int32, bound: np.int32) -> np.int32:
-    """Return the largest label below `bound` that is not the pixel's own; 0 without one."""
+    """Return the largest label in the patch below `bound` that is not the pixel's own; 0 if there is none."""
     most = np.int32(0)
     for i in range(PATCH):
         k = patch[i]

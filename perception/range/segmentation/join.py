@@ -15,28 +15,28 @@ from perception.range.segmentation.seams import crosses_groove, is_grooved_at
 
 PAIR_SAMPLES = 150
 ROUGH_ROUNDS, ROUNDS = as_numpy_scalar(1), as_numpy_scalar(3)  # of robust weights
-JOINED_SHARE = 0.85
-JOINED_MEAN_SQUARE = 1.6
+JOINED_SHARE = 0.85  # least share of each piece's samples that lie near the joint surface
+JOINED_MEAN_SQUARE = 1.6  # squared sigmas; largest mean square of each piece about the joint surface
 ROUGH_STRIDE = 5  # the first fit uses every fifth sample
-ROUGH_SHARE = 0.7  # of the samples must lie near the first fit before all samples are fitted
+ROUGH_SHARE = 0.7  # least share of the samples near the first fit; with less, no fit to all samples is made
 NEAR_SAMPLES = 16  # samples, or all of a smaller piece, that decide whether a surface passes near a piece
-LEAST_NEAR = 4
+LEAST_NEAR = 4  # samples needed for that decision
 NEAR_SIGMAS = 20.0
-SCRAP_SHARE = 0.1
+SCRAP_SHARE = 0.1  # largest size of a fragment, relative to the surface that it belongs to
 SCRAP_SIGMAS = 6.0
-LARGEST_TURN_RAD = 0.2
-SIGHT_LINES = 5
+LARGEST_TURN_RAD = 0.2  # between the planes of two pieces of one plane
+SIGHT_LINES = 5  # shortest lines between two pieces along which a gap is looked for
 GAP_SIGMAS = 6.0
-TOUCHING_PX = 8
+TOUCHING_PX = 8  # pieces that are closer than this count as touching
 GROOVE_PX = 2  # a single pixel may be a gross error
 BEHIND_SHARE = 0.15  # if a larger share of the line is measured behind the surface, there is a gap and no occluder
-APART, SCRAP, JOINED = 0, 1, 2
+APART, SCRAP, JOINED = 0, 1, 2  # results of `related`
 
 
 def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
-    """Join pieces of one surface; returns for each label (k at k - 1) the label that it belongs to afterwards.
+    """Join pieces of one surface; returns a list whose entry k - 1 is the label to which label k belongs afterwards.
 
-    A surface that is not joined keeps its label. Updates `parameters` of the labels that remain.
+    A surface that is not joined keeps its label. Updates the `parameters` of the labels that remain.
     """
     if len(kinds) < 2:
         return list(range(1, len(kinds) + 1))
@@ -57,7 +57,10 @@ def _joined(
     kinds: Indices, ths: Array, samples: Array, starts: Indices, pixels: Indices, order: Indices, depth: Array,
     sen: Array, noise: Array, labels: Labels,
 ) -> Indices:  # fmt: skip
-    """Kernel of `join_pieces`: samples (4, N), piece k's from `starts[k]` on; tried in `order`. Updates `ths`."""
+    """Compute `join_pieces`; returns the owner of each label and updates `ths`.
+
+    Piece k has `pixels[k]` pixels and the samples[:, starts[k] : starts[k + 1]]. `order`: pieces, largest first.
+    """
     perspective = sen[0] > 0
     owner, before = np.arange(1, kinds.shape[0] + 1), ths.copy()
     thin = [np.ascontiguousarray(samples[:, starts[k] : starts[k + 1]]) for k in range(kinds.shape[0])]
@@ -90,9 +93,10 @@ def related(
     kind: int, th: Array, samples: Array, pixels: int, other_kind: int, other: Array, others: Array, other_pixels: int,
     noise: Array, perspective: bool,
 ) -> tuple[int, Array]:  # fmt: skip
-    """Classify the relation of a smaller piece to a larger one: APART, SCRAP (its fragment) or JOINED (one surface).
+    """Classify the relation of a smaller piece to a larger one: APART, SCRAP (a fragment of it) or JOINED (one surface).
 
-    Samples are (4, N) as in `bend`. Also returns the parameters of the larger or the joint surface.
+    The larger piece has kind, parameters and `samples` (4, N, as in `bend`); `other_kind`, `other` and `others` are those
+    of the smaller one. Also returns the parameters of the joint surface (JOINED) or of the larger piece.
     """
     if other_pixels <= SCRAP_SHARE * pixels and _is_scrap(
         kind, th, other_kind, other, others, other_pixels, noise, perspective
@@ -108,7 +112,7 @@ def related(
         if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
             return APART, th
     joint = _fitted(kind, th, both, perspective, ROUNDS)
-    # Where noise is slow, residuals of a piece are distortions, which the joint surface cannot remove: widen the limit.
+    # Slow noise distorts a piece, and the joint surface cannot follow the distortion: the limit grows accordingly.
     own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
     limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
     for s in (samples, others):
@@ -122,7 +126,7 @@ def related(
 def _is_scrap(
     kind: int, th: Array, own_kind: int, own: Array, samples: Array, pixels: int, noise: Array, perspective: bool,
 ) -> bool:  # fmt: skip
-    """Whether a small piece lies so close to a large surface that it is only a dent in it or a part of its rim."""
+    """Return whether a small piece is so close to a large surface that it is only a dent in it or a part of its rim."""
     if bend.scrap_gain(kind, th, own_kind, own, samples, float(pixels), noise, perspective) > 0.0:
         return True
     if kind == PLANE and own_kind != PLANE:
@@ -135,7 +139,7 @@ def _is_scrap(
         if np.isfinite(z):
             hit += 1
             near += abs(samples[2, i] - z) < SCRAP_SIGMAS * samples[3, i]
-    # Rays just outside the outline miss the surface; the rays that hit decide if they are the majority.
+    # Rays just outside the outline miss the surface, so only the rays that hit count; they must be the majority.
     return 2 * hit > samples.shape[1] and near > JOINED_SHARE * hit
 
 
@@ -149,7 +153,7 @@ def _fitted(kind: int, th: Array, s: Array, perspective: bool, rounds: int) -> A
 
 @compiled
 def _trimmed(kind: int, th: Array, s: Array, perspective: bool) -> tuple[float, float]:
-    """Return the share of the samples within the trim, and their mean squared residual in squared sigmas."""
+    """Return the share of the samples with residuals below `TRIM_SIGMAS`, and their mean square in squared sigmas."""
     e = bend.residual_sizes(kind, th, s, perspective)
     kept, total = 0, 0.0
     for i in range(e.shape[0]):
@@ -161,7 +165,7 @@ def _trimmed(kind: int, th: Array, s: Array, perspective: bool) -> tuple[float, 
 
 @compiled
 def _passes_near(kind: int, th: Array, samples: Array, perspective: bool) -> bool:
-    """Whether the extended surface passes near most of a piece: a cheap test before the joint fits."""
+    """Return whether the surface, extended beyond its pixels, passes near most of a piece; a cheap test before joint fits."""
     n, step = samples.shape[1], max(1, samples.shape[1] // NEAR_SAMPLES)
     count, far = (n + step - 1) // step, 0
     for k in range(0, n, step):
@@ -176,9 +180,10 @@ def _passes_near(kind: int, th: Array, samples: Array, perspective: bool) -> boo
 def gap_between(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, kind: int, th: Array, a: Array, b: Array,
 ) -> bool:  # fmt: skip
-    """Whether there is a gap in the surface on most of the shortest lines between two pieces, samples (4, N).
+    """Return whether there is a gap in the surface on most of the shortest lines between two pieces.
 
-    `own` says which of `labels` (H, W) belong to the pieces; other pixels between them may belong to a narrow groove.
+    `a`, `b` (4, N) are samples of the pieces. `own` tells for each label whether it belongs to them; pixels of other
+    labels between them may belong to a narrow groove.
     """
     distance = np.full(a.shape[1], np.inf)
     for n in range(b.shape[1]):
@@ -194,7 +199,7 @@ def gap_between(
 
 @compiled
 def _lessen(x: Array, y: Array, x0: float, y0: float, distance: Array) -> None:
-    """Update the squared distance from each ray (x, y) to its nearest ray in another set with one more ray (x0, y0)."""
+    """Lower the squared `distance` of each ray (x, y) from its nearest ray in another set if the ray (x0, y0) is nearer."""
     for m in range(x.shape[0]):
         dx, dy = x[m] - x0, y[m] - y0
         d2 = dx * dx + dy * dy
@@ -216,10 +221,10 @@ def _is_gap(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, kind: int, th: Array, ax: float, ay: float,
     bx: float, by: float, slack: float,
 ) -> bool:  # fmt: skip
-    """Whether the depth on the line from ray a to ray b shows a gap in the surface.
+    """Return whether the depth on the line from ray a to ray b shows a gap in the surface.
 
-    That is: much of it lies behind the surface, or `GROOVE_PX` successive pixels of neither piece do, or a groove
-    crosses it.
+    There is a gap if much of the line lies behind the surface, if `GROOVE_PX` successive pixels that belong to neither
+    piece do, or if a groove crosses the line. `slack` (m): how far behind the surface noise may move a pixel.
     """
     H, W = depth.shape
     perspective = sen[0] > 0

@@ -15,7 +15,13 @@ def smooth_links(
     z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool, normal: Array, rms: Array,
     cos_limit: float,
 ) -> tuple[Mask, Mask]:  # fmt: skip
-    """Return which free blocks are linked to their right and lower neighbours by a small step in depth and normal."""
+    """Return which free blocks (h, w) are linked to the right and to the lower neighbour: depth and normal change little.
+
+    Args:
+        slope: largest slope that is not a jump, metres of depth per metre across, times the side of a block in pixels.
+        inverse_f: 1 / focal length (pinhole), or the pixel pitch (orthographic).
+        cos_limit: least cosine of the angle between the normals of linked blocks.
+    """
     h, w = z.shape
     right, down = np.zeros((h, w), np.bool_), np.zeros((h, w), np.bool_)
     for r in range(h):
@@ -37,10 +43,11 @@ def smooth_components(
     blocks: Indices, z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool,
     normal: Array, rms: Array, cos_limit: float, least: int, most: int,
 ) -> tuple[Indices, Indices]:  # fmt: skip
-    """Return the components of at least `least` free blocks under the links of `smooth_links`, the `most` largest ones.
+    """Return the `most` largest components, of at least `least` free blocks, that the links of `smooth_links` connect.
 
-    `blocks` (B,): flat indices of the free blocks, ascending. Returns starts (n + 1,) and flat indices (N,): component
-    k, the largest first, owns indices[starts[k] : starts[k + 1]], in raster order.
+    `blocks` (B,): flat indices of the free blocks, ascending; the other arguments are those of `smooth_links`. Returns
+    starts (n + 1,) and flat indices (N,): component k, the largest first, owns indices[starts[k] : starts[k + 1]], in
+    raster order.
     """
     h, w = z.shape
     parent, sizes = np.empty(h * w, np.int64), np.empty(h * w, np.int64)
@@ -74,7 +81,7 @@ def smooth_components(
 def _is_smooth(
     z: Array, normal: Array, rms: Array, r: int, c: int, i: int, j: int, limit: float, cos_limit: float,
 ) -> bool:  # fmt: skip
-    """Whether two blocks differ by at most `limit` in depth and, if both normals are reliable, little in direction."""
+    """Return whether two blocks differ by at most `limit` in depth and little in direction if both normals are reliable."""
     if not abs(z[i, j] - z[r, c]) <= limit:
         return False
     if not (rms[r, c] < STEADY_RMS and rms[i, j] < STEADY_RMS):

@@ -20,15 +20,15 @@ from perception.range.segmentation.merge_criterion import FIGURES, PIXELS, descr
 from perception.range.segmentation.regions import Regions
 from perception.range.segmentation.seams import is_seam_grooved
 
-PART_SAMPLES = 80
+PART_SAMPLES = 80  # samples by which a region is represented
 LEAST_BORDER_PX = 6
 TIP_SHARE = 0.35  # least length of a border, relative to the square root of the smaller region's area
 
 
 def merge_touching(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
-    """Merge touching regions; returns for each label (k at k - 1) the label that it belongs to afterwards.
+    """Merge touching regions; returns a list whose entry k - 1 is the label to which label k belongs afterwards.
 
-    Updates `kinds` and `parameters` of the labels that remain.
+    Updates the `kinds` and `parameters` of the labels that remain.
     """
     if not kinds:
         return []
@@ -46,8 +46,9 @@ class _Graph:
 
     Attributes:
         kinds, ths: kinds (count,) and parameters (count, 16).
-        few, normals, figures: samples (4, n) and normals (n, 3) of each, and figures (count + 1, FIGURES), entry 0 unused.
-        owner: (count + 1,) the label that each belongs to.
+        few, normals: samples (4, n) and normals (n, 3) of each region.
+        figures: (count + 1, FIGURES) of each region, as in `merge_criterion`; entry 0 is unused.
+        owner: (count + 1,) the label to which each label now belongs.
         pairs: (P, 2) labels a < b that touch; both are 0 for a pair that no longer exists.
         lengths, x, y: number of pixels of each border, and the rays (n,) of some of them.
         gains, is_old: (P,) gain of merging each pair, and whether it is up to date.
@@ -119,7 +120,7 @@ def _described_graph(regions: Regions, kinds: Indices, ths: Array) -> _Graph:
 
 
 def _gain_of(p: int, graph: _Graph, regions: Regions) -> tuple[float, int, Array]:
-    """Return the gain of merging pair p (not merged if 0 or less), and kind and parameters of the joint surface."""
+    """Return the gain of merging pair p (0 or less: not merged), and the kind and parameters of the joint surface."""
     kinds, ths, few, normals, figures = graph.kinds, graph.ths, graph.few, graph.normals, graph.figures
     a, b = graph.pairs[p].tolist()
     length_px = int(graph.lengths[p])
@@ -140,7 +141,10 @@ def _gain_of(p: int, graph: _Graph, regions: Regions) -> tuple[float, int, Array
 
 
 def _most_gainful(gains: Array, pairs: Labels) -> int | None:
-    """Return the pair with the largest gain, of equal ones the last in label order; None if no gain is positive."""
+    """Return the index of the pair with the largest gain, or None if no gain is positive.
+
+    Of several equal gains the last in label order wins, so that results are repeatable.
+    """
     most = gains.max(initial=0.0)
     if not most > 0.0:
         return None

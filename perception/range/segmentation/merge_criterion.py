@@ -1,8 +1,9 @@
 """Merge criterion of two touching regions: whether one surface describes both at a lower cost than two (compiled).
 
-A region is given by its kind, parameters, (4, N) samples, their (N, 3) normals on its surface, and its figures: number
-of pixels (PIXELS), number of independent noise values among them (PATCHES), mean squared residual in squared sigmas
-(MEAN_SQUARE), standard deviation of its tilt in radians (TILT), and side of a square of its area in metres (SIZE_M).
+A region is given by its kind, parameters, (4, N) samples, their (N, 3) normals on its surface, and its figures. These
+are the number of pixels (PIXELS), the number of independent noise values among them (PATCHES), the mean squared
+residual in squared sigmas (MEAN_SQUARE), the standard deviation of its tilt in radians (TILT), and the side of a square
+of its area in metres (SIZE_M). `pitch` is the distance between pixels in ray coordinates.
 """
 
 from __future__ import annotations
@@ -25,23 +26,23 @@ ROUNDS = as_numpy_scalar(3)  # of robust weights
 COEFFICIENTS = as_numpy_scalar(6)  # of a quadratic over x and y
 STEP_SIGMAS = 3.0
 SHARPEST_TURN_RAD = 1.2  # between facets of one narrow cylinder; an edge of a box turns by 1.57
-SMOOTH_TURN_RAD = 0.05
-SMOOTH_SIGMAS = 3.0
-SMOOTH_SHARE = 0.8  # of both parts must lie within `SMOOTH_LIMIT` of the joint surface if no crease separates them
-SMOOTH_LIMIT = 5.0
-LEAST_SHARE = 0.85
-UNEVEN_TURN_RAD = 0.25  # between facets of one face
+SMOOTH_TURN_RAD = 0.05  # smaller angles are no crease
+SMOOTH_SIGMAS = 3.0  # nor are angles below this multiple of the standard deviation of both tilts
+SMOOTH_SHARE = 0.8  # least share of each part near the joint surface if no crease separates the parts
+SMOOTH_LIMIT = 5.0  # sigmas; largest residual that counts as near in that case
+LEAST_SHARE = 0.85  # least share of each part within the trim of the joint surface
+UNEVEN_TURN_RAD = 0.25  # between facets of one uneven face
 ROUNDING_PX = 4.0  # largest width of a rounded edge
 ROUNDING_TURN_RAD = 0.6
 ROUNDING_SIGMAS = 2.0
-UNEVEN_SHARE = 0.02  # of the smaller facet's size
-LEAST_GAIN = 1e-3
-SCRAP_SHARE = 0.1  # of the larger part
-PLAIN_MEAN_SQUARE = 1.6
+UNEVEN_SHARE = 0.02  # unevenness accepted in a face, as a ratio of the smaller facet's size
+LEAST_GAIN = 1e-3  # gain of a merge that is made for another reason than its cost
+SCRAP_SHARE = 0.1  # largest size of a fragment or rounded edge, relative to the larger part
+PLAIN_MEAN_SQUARE = 1.6  # squared sigmas; limit of the mean square of a part with many independent noise values
 MOST_NOISE = 2.5  # largest ratio of observed to modelled variance by which the limits are widened
-CREASE_MEAN_SQUARE = 2.0  # if the residual of a quadratic exceeds the limit this many times, no surface fits
-# Mean square of a rough fit, cut at five sigmas, above which a full fit cannot reach the limits. GIVE_UP holds for two
-# planes or a smooth border; otherwise it is the limit plus SLACK.
+CREASE_MEAN_SQUARE = 2.0  # if the mean square of a quadratic exceeds the limit by this factor, no surface fits
+# Mean square of a rough fit, with residuals cut at five sigmas, above which a full fit cannot reach the limits. GIVE_UP
+# is used for two planes or a smooth border; otherwise the threshold is the limit plus SLACK.
 GIVE_UP = 10.0
 SLACK = 3.0
 
@@ -50,10 +51,7 @@ SLACK = 3.0
 def described(
     kind: int, th: Array, samples: Array, pixels: float, pitch: float, noise: Array, perspective: bool,
 ) -> tuple[int, Array, Array, Array]:  # fmt: skip
-    """Describe one region by the simplest suitable surface; returns kind, parameters, normals and figures.
-
-    `pitch`: distance between pixels, in ray coordinates.
-    """
+    """Describe a region by the simplest suitable surface; returns its kind, parameters, normals and figures."""
     patches = max(pixels / (1.0 + slow_share_at(noise, np.median(samples[2])) * (SLOW_NOISE_AREA_PX - 1.0)), 1.0)
     kind, th = bend.simplest(kind, th, samples, perspective, patches)
     normals = bend.surface_normals(kind, th, samples, perspective)
@@ -66,7 +64,8 @@ def figures_of(
 ) -> Array:  # fmt: skip
     """Return the figures (FIGURES,) of a region.
 
-    Its tilt is sigma / (spread sqrt(patches)), the standard deviation of the slope of a plane fitted to noisy values.
+    The standard deviation of its tilt is that of a plane fitted to noisy values, sigma / (spread sqrt(patches)), with
+    the spread of the points in the direction in which it is least.
     """
     out = np.empty(FIGURES)
     out[PIXELS], out[PATCHES] = pixels, patches
@@ -90,9 +89,10 @@ def united(
     kind: int, th: Array, samples_a: Array, normals_a: Array, figures_a: Array, samples_b: Array, normals_b: Array,
     figures_b: Array, most: int, pitch: float, perspective: bool,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return samples, normals and figures of two regions that have been merged.
+    """Return samples, normals and figures of the union of two regions, which the surface `kind`, `th` describes.
 
-    Each contributes samples in proportion to its pixels, but at least a fifth of `most`, evenly spread over its own.
+    Each region contributes an evenly spread choice of its samples, in proportion to its pixels but at least a fifth.
+    There are at most `most` samples.
     """
     pixels, patches = figures_a[PIXELS] + figures_b[PIXELS], figures_a[PATCHES] + figures_b[PATCHES]
     share = min(max(figures_b[PIXELS] / pixels, 0.2), 0.8)
@@ -125,7 +125,8 @@ def judged(
 ) -> tuple[float, int, Array]:  # fmt: skip
     """Find the best joint surface of two regions that touch at the rays (x, y); returns its gain, kind and parameters.
 
-    With a gain of 0 or less they stay separate.
+    The gain is the cost of two surfaces minus that of one; with a gain of 0 or less the regions stay separate.
+    `length_px`: number of pixels of their border.
     """
     shown = shown_noise(figures_a, figures_b)
     step, turn = step_and_turn(kind_a, a, kind_b, b, x, y, noise, perspective)
@@ -148,7 +149,7 @@ def judged(
             own, continued = (kind_a, a) if figures_a[PIXELS] >= figures_b[PIXELS] else (kind_b, b)
             goes_on = own != PLANE and fit.rough_mean_square(own, continued, samples, perspective) <= give_up
             if goes_on:
-                # If the surface of the larger region also explains the smaller one, no other kind need be tried.
+                # If the surface of the larger region also explains the smaller one, no other kind needs to be tried.
                 continued = _continued(own, continued, samples, perspective)
                 gain, _ = _gain(
                     own, continued, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
@@ -196,7 +197,7 @@ def _continued(kind: int, th: Array, samples: Array, perspective: bool) -> Array
 def _joint_fits(
     samples: Array, normals: Array, perspective: bool, kinds: Mask, correlated: float, give_up: float,
 ) -> tuple[Array, Mask]:  # fmt: skip
-    """Fit each of `kinds` to the samples of both regions; returns parameters (5, SIZE) and which kinds fit."""
+    """Fit each of `kinds` (5,) to the samples of both regions; returns parameters (5, SIZE) and which kinds fit."""
     points = bend.points_of(samples, perspective)
     x, y, z, sigma = samples[0], samples[1], samples[2], samples[3]
     ths, _, kept, score = fit.fit_kinds(
@@ -212,8 +213,8 @@ def _gain(
 ) -> tuple[float, bool]:  # fmt: skip
     """Return the cost of two surfaces minus that of the joint surface; minus infinity if it does not describe both.
 
-    Also returns whether the regions meet without a crease and lie near the joint surface; they are then merged whatever
-    the cost.
+    Also returns whether the regions meet without a crease and lie near the joint surface. They are then merged
+    regardless of the cost.
     """
     shown = shown_noise(figures_a, figures_b)
     patches_a, patches_b = figures_a[PATCHES], figures_b[PATCHES]
@@ -235,14 +236,14 @@ def _gain(
 
 @compiled
 def _is_strip(pixels_a: float, pixels_b: float, length_px: int) -> bool:
-    """Whether the smaller region is a narrow strip along its border with a much larger one."""
+    """Return whether the smaller region is a narrow strip along its border with a much larger one."""
     less = min(pixels_a, pixels_b)
     return less < ROUNDING_PX * length_px and less < SCRAP_SHARE * max(pixels_a, pixels_b)
 
 
 @compiled
 def _is_uneven(th: Array, samples_a: Array, samples_b: Array, tolerance_m: float, perspective: bool) -> bool:
-    """Whether two facets deviate from the plane `th` by at most the unevenness accepted for upholstery or cardboard."""
+    """Return whether most of two facets lies within `tolerance_m` of the plane `th`, as uneven upholstery or cardboard does."""
     for side in range(2):
         samples = samples_a if side == 0 else samples_b
         e = bend.residual_sizes(PLANE, th, samples, perspective) * samples[3]
@@ -256,7 +257,7 @@ def _swallowed(
     is_rounding: bool, kind: int, th: Array, figures: Array, own_kind: int, own: Array, samples: Array,
     own_figures: Array, noise: Array, perspective: bool,
 ) -> tuple[float, int, Array]:  # fmt: skip
-    """Return the gain of merging a rounded edge or scrap (`own`) into the larger region, and the latter's surface."""
+    """Return the gain of merging a rounded edge or a fragment (`own`) into the larger region, and the latter's surface."""
     if is_rounding:
         return LEAST_GAIN, kind, th
     if own_figures[PIXELS] > SCRAP_SHARE * figures[PIXELS]:
@@ -266,7 +267,7 @@ def _swallowed(
 
 @compiled
 def _is_creased(samples: Array, perspective: bool, limit: float) -> bool:
-    """Whether the mean squared residual of a quadratic in x and y exceeds `limit` squared sigmas per sample.
+    """Return whether the mean squared residual of a quadratic in x and y exceeds `limit` squared sigmas per sample.
 
     A quadratic follows any smooth surface that turns by at most `SHARPEST_TURN_RAD`. If it fails, no joint surface
     needs to be fitted.
@@ -302,7 +303,10 @@ def _is_creased(samples: Array, perspective: bool, limit: float) -> bool:
 
 @compiled
 def shown_noise(figures_a: Array, figures_b: Array) -> float:
-    """Ratio of observed to modelled variance of two regions, from 1 to `MOST_NOISE`; slanted faces scatter more."""
+    """Return the ratio of observed to modelled variance of two regions, from 1 to `MOST_NOISE`.
+
+    It exceeds 1 on slanted faces, for example, where depth scatters more than the noise model says.
+    """
     na, nb = figures_a[PATCHES], figures_b[PATCHES]
     shown = (figures_a[MEAN_SQUARE] * na + figures_b[MEAN_SQUARE] * nb) / (na + nb)
     return float(min(max(1.0, shown), MOST_NOISE))
@@ -310,8 +314,8 @@ def shown_noise(figures_a: Array, figures_b: Array) -> float:
 
 @compiled
 def mean_square_limit(patches: float) -> float:
-    """Limit that the mean square of n residuals of a correct surface meets with probability 0.97: 1 + 2 sqrt(2 / n).
+    """Return the limit 1 + 2 sqrt(2 / n) of the mean square of n residuals, but at least `PLAIN_MEAN_SQUARE`.
 
-    It is at least `PLAIN_MEAN_SQUARE`.
+    A correct surface meets it with probability 0.97, because the mean square has the standard deviation sqrt(2 / n).
     """
     return float(max(PLAIN_MEAN_SQUARE, 1.0 + 2.0 * np.sqrt(2.0 / patches)))

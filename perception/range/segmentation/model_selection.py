@@ -24,18 +24,18 @@ ROUNDS = 6
 MOST_COMPONENTS = 48  # per round
 MOST_ATTEMPTS = 120  # per grid; bounds the time spent on irregular scenes
 FIT_SAMPLES = 90
-GOOD_MEAN_SQUARE = 2.0
-GOOD_SHARE = 0.75
+GOOD_MEAN_SQUARE = 2.0  # squared sigmas; largest mean square of a surface that explains its blocks
+GOOD_SHARE = 0.75  # least share of the samples within the trim of such a surface
 WHOLE_SHARE = 0.85  # if a fit to the whole component explains less, fits to parts of it are tried as well
-LOCAL_BLOCKS = 45
-LOCAL_TRIES = 5
-FEW_BLOCKS_FOR_QUADRIC = 60
-GIVE_UP = 14.0  # rough mean square; a converged fit with three quarters within three sigmas has 8 at most
+LOCAL_BLOCKS = 45  # in such a part
+LOCAL_TRIES = 5  # number of such parts
+FEW_BLOCKS_FOR_QUADRIC = 60  # a quadric is not fitted to smaller components
+GIVE_UP = 14.0  # mean square of a rough fit above which a kind is dropped; one that can succeed has 8 at most
 
 
 @dataclass(slots=True, eq=False)
 class Candidates:
-    """Surfaces found so far; label k is `kinds[k - 1]`, `parameters[k - 1]`. Grows while segmentation runs."""
+    """Surfaces found so far: label k has kind `kinds[k - 1]` and parameters `parameters[k - 1]` (16,)."""
 
     kinds: list[int] = field(default_factory=list)
     parameters: list[Array] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Candidates:
         return len(self.kinds)
 
     def arrays(self) -> tuple[NDArray[np.int64], Array]:
-        """Kinds (n + 1,) and parameters (n + 1, 16), entry 0 unused, for compiled loops."""
+        """Return the kinds (n + 1,) and parameters (n + 1, 16) for compiled loops; entry 0 is unused."""
         kinds = np.array([0, *self.kinds], np.int64)
         table = np.array([np.zeros(SIZE), *self.parameters])
         return kinds, table
@@ -90,7 +90,7 @@ def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, 
 def _best_model(
     grid: Grid, cos_limit: float, free: Flags, members: Indices, least: int
 ) -> tuple[int, Array, Indices] | None:
-    """Return kind, parameters and blocks (flat) of the surface that explains most of `members`; None without one."""
+    """Return kind, parameters and blocks (flat indices) of the surface that explains most of `members`; None if none does."""
     kind, th, share = _fitted(grid, members)
     fits = [(kind, th)]
     if kind < 0 or share < WHOLE_SHARE:
@@ -140,9 +140,9 @@ def _fit_blocks(
     x: Array, y: Array, z: Array, sigma: Array, normal: Array, perspective: bool, pixels: int, slow_share: float,
     members: Indices,
 ) -> tuple[int, Array, float]:  # fmt: skip
-    """Fit all kinds to the blocks `members` (flat); returns the best kind, its parameters (16,) and share explained.
+    """Fit all kinds to the blocks `members` (flat indices); returns the best kind, its parameters (16,) and share explained.
 
-    The kind is -1 if none explains them.
+    The kind is -1 if none explains the blocks. `pixels`: number of pixels per block. `slow_share`: as in `Grid`.
     """
     count = members.shape[0]
     if count < 5:
@@ -162,7 +162,7 @@ def _fit_blocks(
             known += 1
     kinds = np.ones(5, np.bool_)
     kinds[QUADRIC] = count >= FEW_BLOCKS_FOR_QUADRIC
-    # Slow noise is common to neighbouring samples; this many samples count as one independent sample.
+    # Slow noise is common to neighbouring samples, so `correlated` samples count as one independent sample.
     patches = max(count * pixels / SLOW_NOISE_AREA_PX, 1.0)
     correlated = 1.0 + slow_share * max(n / patches - 1.0, 0.0)
     ths, mean2, kept, score = fit.fit_kinds(

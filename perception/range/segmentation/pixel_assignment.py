@@ -11,9 +11,9 @@ from perception.range.fitting.surfaces import PLANE, depth_on, normal_on
 from perception.range.segmentation.boundary_pixels import WORD, column_range, flag_free, flagged, new_columns
 from perception.range.segmentation.grid import sigma_at
 
-ASSIGNMENT_SIGMAS = 3.5
-PLAIN_SIGMAS = 1.0  # a pixel whose residual from its own block's surface is smaller is not compared with others
-MAX_CANDIDATES = 8
+ASSIGNMENT_SIGMAS = 3.5  # largest residual of a pixel from the surface to which it is assigned
+PLAIN_SIGMAS = 1.0  # a pixel with a smaller residual from the surface of its own block is not compared with others
+MAX_CANDIDATES = 8  # surfaces among which a pixel is assigned
 SEVERAL = np.int32(-1)  # marks blocks and pixels for which several surfaces must be compared
 EASED = 0.4  # smallest factor by which a residual is reduced at a grazing ray
 
@@ -25,8 +25,8 @@ def assign_pixels(
 ) -> None:  # fmt: skip
     """Label each pixel of `depth` (H, W) with the best surface among those of the 3x3 blocks around it.
 
-    Writes the rows of blocks [top, bottom) of `out` (H, W) int32: label, or 0 beyond `ASSIGNMENT_SIGMAS`. Labels index
-    `kinds` and `ths` from 1.
+    `blocks` (h, w) are the labels of blocks of `size` pixels; labels index `kinds` and `ths` from 1. Writes the pixels of
+    the rows of blocks [top, bottom) into `out` (H, W) int32: a label, or 0 if no residual is below `ASSIGNMENT_SIGMAS`.
     """
     w = blocks.shape[1]
     perspective = sen[0] > 0
@@ -61,7 +61,8 @@ def _assign_first(
 ) -> None:  # fmt: skip
     """Compare the pixels of the r-th row of blocks with the only surface around, or else with that of their `own` block.
 
-    If there are several surfaces, a pixel that its own one does not explain within `PLAIN_SIGMAS` becomes `SEVERAL`.
+    `only` is that of `_only_labels`. Where several surfaces are around, a pixel that the surface of its own block does not
+    explain within `PLAIN_SIGMAS` gets the mark `SEVERAL`.
     """
     H, W = depth.shape
     w = own.shape[0]
@@ -197,7 +198,7 @@ def _labels_around(labels: Labels, v: int, u: int, near: Labels) -> int:
 def misfit_of(
     k: np.int32, kinds: Indices, ths: Array, x: float, y: float, z: float, sigma: float, perspective: bool,
 ) -> float:  # fmt: skip
-    """Return `misfit` of surface k of a table, with a short cut for planes, which are most frequent."""
+    """Return the `misfit` of surface k of a table, with a short cut for planes, which are most frequent."""
     if kinds[k] != PLANE:
         return misfit(kinds[k], ths[k], x, y, z, sigma, perspective)
     p = 1.0 if perspective else 0.0
@@ -209,9 +210,9 @@ def misfit_of(
 
 @compiled
 def misfit(kind: int, th: Array, x: float, y: float, z: float, sigma: float, perspective: bool) -> float:
-    """Return |z - surface| in sigmas; infinite on a miss.
+    """Return the absolute residual of depth z at the ray (x, y) in sigmas; infinite if the ray misses the surface.
 
-    It is reduced at grazing rays, because half a pixel changes the depth much there.
+    Large residuals from curved surfaces are reduced at grazing rays, because half a pixel changes the depth much there.
     """
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
@@ -241,7 +242,7 @@ def fill_small_gaps(label: Labels, depth: Array, sweeps: int) -> None:
 
 @compiled
 def _agreed(label: Labels, v: int, u: int) -> int:
-    """Return the label that at least 5 of 8 neighbours have; 0 without one."""
+    """Return the label that at least 5 of the 8 neighbours have; 0 if there is none."""
     for i in range(4):  # a label of five neighbours is among any four
         k = label[v - 1 + i // 3, u - 1 + i % 3]
         if k == 0:

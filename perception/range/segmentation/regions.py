@@ -52,11 +52,11 @@ class Regions:
         )
 
     def runs_of(self, label: int) -> Labels:
-        """The runs (R, 3) of a label, in raster order: row, first column, and the one after the last."""
+        """Return the runs (R, 3) of a label in raster order: row, first column, and the column after the last."""
         return self.runs[self.starts[label] : self.starts[label + 1]]
 
     def places(self, label: int) -> Labels:
-        """Flat pixel indices of a label, in raster order."""
+        """Return the flat pixel indices (N,) of a label, in raster order."""
         return np.asarray(places_of(self.runs_of(label), self.labels.shape[1]))
 
     def renamed(self, names: Labels) -> Labels:
@@ -83,7 +83,7 @@ def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count:
 def _spread_samples(
     depth: Array, sen: Array, noise: Array, starts: Indices, runs: Labels, sizes: Indices, most: int,
 ) -> Array:  # fmt: skip
-    """Return samples (count, 4, most) of each label; a label with fewer pixels leaves the rest unset."""
+    """Return samples (count, 4, most) of each label; entries beyond the number of a label's pixels are unset."""
     count = sizes.shape[0] - 1
     out = np.empty((count, 4, most))
     for k in range(1, count + 1):

@@ -15,22 +15,22 @@ from hal.jit import compiled
 from perception.range.fitting.surfaces import PLANE, depth_on
 from perception.range.segmentation.grid import sigma_at
 
-BEYOND = 0.05  # of the image's shorter side, by which a line extends beyond a seam, because rims are rounded
-DEEP_SIGMAS = 4.0
-DEEP_PX = 2  # in a row: one may be a gross error
-FLANK_SIGMAS = 3.0
-FLANK_PX = 3  # on the surface, on either side
-SHARE = 0.33  # of the places on a seam
+BEYOND = 0.05  # of the image's shorter side: how far a line extends beyond a seam, because rims are rounded
+DEEP_SIGMAS = 4.0  # a pixel farther behind the plane is in a groove
+DEEP_PX = 2  # successive pixels that make a groove; a single one may be a gross error
+FLANK_SIGMAS = 3.0  # a pixel nearer than this is on the plane
+FLANK_PX = 3  # least number of pixels on the plane on either side of a groove
+SHARE = 0.33  # of the places on a seam that a groove must cross
 
 
 @compiled
 def is_seam_grooved(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, x: Array, y: Array,
 ) -> bool:  # fmt: skip
-    """Whether a groove crosses the image row or column at more than the share `SHARE` of the rays (x, y) on a seam.
+    """Return whether a groove crosses the row or column at more than the share `SHARE` of the rays (x, y) on a seam.
 
-    `own` says which of `labels` (H, W) belong to the two regions that meet at the seam; the pixels of a groove belong to
-    neither.
+    `own` tells for each label whether it belongs to one of the two regions that meet at the seam; the pixels of a groove
+    belong to neither. `th` is the plane.
     """
     grooves = 0
     for k in range(x.shape[0]):
@@ -43,7 +43,7 @@ def is_seam_grooved(
 def is_grooved_at(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, u: float, v: float,
 ) -> bool:  # fmt: skip
-    """Whether a groove crosses the image row or column through pixel (u, v)."""
+    """Return whether a groove crosses the image row or column through pixel (u, v)."""
     image = (depth, sen, noise, labels, own, th, u, v)
     return crosses_groove(*image, 0.0, 1.0, 0) or crosses_groove(*image, 1.0, 0.0, 0)
 
@@ -53,7 +53,7 @@ def crosses_groove(
     depth: Array, sen: Array, noise: Array, labels: Labels, own: Mask, th: Array, u0: float, v0: float, du: float,
     dv: float, count: int,
 ) -> bool:  # fmt: skip
-    """Whether the line from pixel (u0, v0), `count` steps (du, dv) long and extended at both ends, crosses a groove."""
+    """Return whether a groove crosses the line from pixel (u0, v0) over `count` steps (du, dv), extended at both ends."""
     H, W = depth.shape
     perspective = sen[0] > 0
     reach = int(BEYOND * min(H, W) + 0.5)

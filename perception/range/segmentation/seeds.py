@@ -7,13 +7,17 @@ import numpy as np
 from hal.arrays import Array, Labels, Mask
 from hal.jit import compiled
 
-LEVELS = 64  # of flatness in the counting sort
-LONE_BEND = 0.02  # bend assumed towards a neighbour without a normal
+LEVELS = 64  # levels of flatness in the counting sort
+LONE_BEND = 0.02  # 1 - cosine of the angle that is assumed towards a neighbour without a normal
 
 
 @compiled
 def seed_order(normal: Array, rms: Array, free: Mask, reach: int) -> Labels:
-    """Return the flat indices of free blocks with a tangent plane, flattest neighbourhood first (counting sort)."""
+    """Return the flat indices of the free blocks with a tangent plane, flattest neighbourhood first (counting sort).
+
+    Flatness is judged from the residual of the tangent plane and the angles to the normals `reach` blocks away on four
+    sides.
+    """
     h, w = rms.shape
     normals, known = _framed_normals(normal, rms, free, reach)
     cosine, bend, levels = np.empty(w), np.empty(w), np.empty((h, w), np.int32)
@@ -76,7 +80,7 @@ def _add_bend(cosine: Array, bend: Array) -> None:
 
 @compiled
 def _fill_levels(bend: Array, rms: Array, known: Array, levels: Labels) -> None:
-    """Fill `levels`: from 0 for a flat neighbourhood with small residuals upwards; -1 for a block without a normal."""
+    """Fill `levels`: 0 for a flat neighbourhood with small residuals, more for others, and -1 for a block without a normal."""
     for c in range(bend.shape[0]):
         level = min(LEVELS - 1.0, 12.0 * np.sqrt(max(25.0 * bend[c], 0.0)) + 4.0 * max(rms[c] - 1.0, 0.0))
         levels[c] = np.int32(level if known[c] == known[c] else -1.0)

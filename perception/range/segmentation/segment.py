@@ -33,22 +33,27 @@ from perception.range.tiles import for_each_tile
 
 Labels = NDArray[np.int32]
 
-LEAST_PIXELS_AT_256 = 32  # per 256 x 256 pixels of image
+LEAST_PIXELS_AT_256 = 32  # pixels of the smallest surface in an image of 256 x 256 pixels
 LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of a curved surface, so model selection decides about it
 LEAST_CURVED_BLOCKS = 16  # smaller surfaces are searched for with smaller blocks
 STEEP_SLOPE = 14.0  # blocks that remain after the large surfaces are found may be tilted by up to 86 degrees
-LARGE_PLANE_BLOCKS = 80
+LARGE_PLANE_BLOCKS = 80  # planes of so many blocks show whether the noise model is right
 SETTLED_MEAN_SQUARE = 1.25  # of residuals cut at three sigmas; noise wider than modelled gives 1.5 and more
-WIDER = 1.5
-WIDENINGS = 5
+WIDER = 1.5  # factor by which the noise model is widened at a time
+WIDENINGS = 5  # at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
-    """Input of every step: the (H, W) depth in metres, the sensor, and the number of tiles for parallel pixel work.
+    """Input of every step of the segmentation.
 
-    The depth may be a part of the sensor's image that begins at row and column `corner_px`. `depths_m` (5,): the whole
-    image's `typical_depths_m`. `packed` (5,): the sensor of this part of the image, in the form that kernels read.
+    Attributes:
+        depth_m: (H, W) depth in metres; the sensor's image, or the part of it that begins at `corner_px`.
+        sensor: model of the whole image.
+        depths_m: (5,) `typical_depths_m` of the whole image.
+        tiles, pool: number of parts in which pixels are processed in parallel, and the threads for them.
+        corner_px: row and column of the sensor's image at which `depth_m` begins.
+        packed: (5,) the sensor of this part of the image, in the form that kernels read.
     """
 
     depth_m: Array
@@ -155,7 +160,7 @@ def _reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates,
 
 
 def icm_labels(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, sweeps: int) -> Labels:
-    """Let pixels that several surfaces explain follow their neighbours, in `sweeps` of iterated conditional modes.
+    """Reassign pixels that several surfaces explain by their neighbours' labels, in `sweeps` iterations (see `icm`).
 
     Returns `labels`, changed in place.
     """
@@ -170,7 +175,7 @@ def icm_labels(task: Task, noise: NoiseModel, labels: Labels, found: Candidates,
 
 
 def _contested(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]:
-    """Return `contested_pixels` of the whole image, computed in tiles."""
+    """Return rows and columns of the `contested_pixels` of the whole image, computed in tiles."""
     parts: dict[int, tuple[Labels, Labels]] = {}
 
     def look(top: int, bottom: int) -> None:
@@ -184,7 +189,10 @@ def _contested(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]
 def _judged(
     task: Task, judge: Callable[..., object], labels: Labels, rows: Labels, columns: Labels
 ) -> tuple[Labels, Labels]:
-    """Compute new labels of all pixels from the current ones, then write them; returns the pixels that changed."""
+    """Compute new labels of the pixels with `judge`, all from the current labels, and only then write them.
+
+    Returns rows and columns of the pixels that changed.
+    """
     names = np.empty_like(rows)
     for_each_tile(partial(judge, rows, columns, names), rows.size, task.tiles, pool=task.pool)
     moved: tuple[Labels, Labels] = renamed_pixels(labels, rows, columns, names)

@@ -1,8 +1,9 @@
 """Tangent planes of all blocks of a grid, computed in runs of blocks.
 
-The rows of a run are at fixed offsets in one scratch array, and the loops have no branch. Only then can the compiler
-prove that nothing overlaps, and handle four blocks with one instruction. The neighbours of a run are held in rows that
-are wider by the window, so that each row of blocks is loaded once for all shifts.
+A run is a sequence of blocks in one row of the grid. The quantities of a run (one row of numbers each) are at fixed
+offsets in one scratch array, and the loops have no branch. Only then can the compiler prove that nothing overlaps, and
+process four blocks with one instruction. The neighbours of a run are held in longer rows, which include the window's
+margin, so that each row of blocks is loaded once for all shifts.
 """
 
 from __future__ import annotations
@@ -12,21 +13,22 @@ import numpy as np
 from hal.arrays import Array, Labels
 from hal.jit import as_numpy_scalar, compiled
 
-JUMP_SIGMAS = 4.0
-LEAST_SHARE = 0.4  # of the window's blocks must lie on the surface
+JUMP_SIGMAS = 4.0  # noise allowed in a depth step that is not a jump
+LEAST_SHARE = 0.4  # least share of the window's blocks that no jump separates from the middle block
 TURN_RAD = 0.15  # between neighbouring blocks of one face
-WINDOW_BEND = 0.0745 * TURN_RAD  # rms, per length, of a parabola that turns by TURN_RAD over twice that length
+WINDOW_BEND = 0.0745 * TURN_RAD  # rms deviation per length of a parabola that turns by TURN_RAD over twice that length
 LEAST_FACING = 0.15  # below this cosine of incidence normals are too inaccurate
 STEADY_RMS = 1.8  # sigmas; a tangent plane with larger residuals lies on a crease or in noise
-GAP = 8  # empty blocks that end a run
+GAP = 8  # number of successive empty blocks that end a run
 FIRST = as_numpy_scalar(0)
-RUN = 128  # blocks at most
-X0, Y0, Z0, G0, BASE, SLOPE = (row * RUN for row in range(6))  # where the rows of the run's own blocks begin
-N, S, SX, SY, SG, SXX, SXY, SYY, SXG, SYG, SGG = (row * RUN for row in range(6, 17))  # sums over its neighbours
-NX, NY, NZ, RMS = (row * RUN for row in range(17, 21))  # the planes
+RUN = 128  # largest number of blocks in a run
+# Where the rows of the scratch array begin: the run's own blocks, the sums over their neighbours, and the planes.
+X0, Y0, Z0, G0, BASE, SLOPE = (row * RUN for row in range(6))
+N, S, SX, SY, SG, SXX, SXY, SYY, SXG, SYG, SGG = (row * RUN for row in range(6, 17))
+NX, NY, NZ, RMS = (row * RUN for row in range(17, 21))
 SCRATCH = 21 * RUN
-WIDE = RUN + 16  # a row of neighbours: room for a radius of eight blocks
-X, Y, Z, G, K = (row * WIDE for row in range(5))
+WIDE = RUN + 16  # length of a row of neighbours: room for a radius of eight blocks
+X, Y, Z, G, K = (row * WIDE for row in range(5))  # where the rows of neighbours begin; g is 1 / z or z, k the weight
 
 
 @compiled
@@ -34,7 +36,7 @@ def tangent_planes(
     x: Array, y: Array, z: Array, count: Labels, sigma: Array, perspective: bool, radius: int, slope_per_block: float,
     normal: Array, rms: Array, top: int, bottom: int,
 ) -> None:  # fmt: skip
-    """Fit a plane to the blocks around each block that no depth jump separates from it; writes rows [top, bottom).
+    """Fit a plane to those blocks around each block that no depth jump separates from it; writes rows [top, bottom).
 
     Args:
         x, y, z, count, sigma: (h, w) as in `Grid`, NaN depth where a block is empty; `count` is the weight of a block.
@@ -64,7 +66,10 @@ def tangent_planes(
 
 @compiled
 def _next_run(z: Array, start: int) -> tuple[int, int]:
-    """Return [start, end) of the next run of known depths without a gap of `GAP` empty blocks; (w, w) without one."""
+    """Return [start, end) of the next run of known depths, from `start` on; (w, w) if there is none.
+
+    A run has at most `RUN` blocks and no gap of `GAP` empty ones.
+    """
     w = z.shape[0]
     while start < w and not np.isfinite(z[start]):
         start += 1
@@ -78,7 +83,7 @@ def _next_run(z: Array, start: int) -> tuple[int, int]:
 
 @compiled
 def _load_own(x: Array, y: Array, z: Array, sigma: Array, perspective: bool, work: Array) -> None:
-    """Load the blocks of the run, and the limits of a jump at each, into `work`."""
+    """Load the blocks of the run into `work`, and from which depth step on a neighbour of each is beyond a jump."""
     n = x.shape[0]
     for c in range(n):
         work[X0 + c], work[Y0 + c], work[Z0 + c] = x[c], y[c], z[c]
@@ -110,9 +115,11 @@ def _load(x: Array, y: Array, z: Array, count: Labels, perspective: bool, at: in
 
 @compiled
 def _add(reach: float, n: int, at: int, wide: Array, work: Array) -> None:
-    """Add one neighbour of every block, if it is near, to the sums of 1, k, and k times x, y, g, xx, xy, yy, xg, yg, gg.
+    """Add one neighbour of every block, if no jump separates them, to the block's sums.
 
-    k is the weight of the neighbour. That of the first block is at offset `at` in the rows of `wide`.
+    These are the sums of 1, k, and k times x, y, g, xx, xy, yy, xg, yg, gg, where k is the neighbour's weight and x, y, g
+    are relative to the block. The neighbour of the first block is at offset `at` in the rows of `wide`. `reach`: largest
+    step that is not a jump at a unit depth, without noise.
     """
     x, y, z, g, count = wide[X + at :], wide[Y + at :], wide[Z + at :], wide[G + at :], wide[K + at :]
     for c in range(n):
@@ -137,9 +144,9 @@ def _add(reach: float, n: int, at: int, wide: Array, work: Array) -> None:
 
 @compiled
 def _solve(n: int, least: float, perspective: bool, work: Array) -> None:
-    """Compute the planes' normals towards the sensor and rms residuals in sigmas; NaN where a plane is not determined.
+    """Compute the normals of the planes, towards the sensor, and their rms residuals in sigmas; NaN if not determined.
 
-    The centred sums of the window give the slopes (a, b) of g.
+    The plane g = a x + b y + c of each window follows by linear least squares from its sums.
     """
     p = 1.0 if perspective else 0.0
     for c in range(n):

@@ -17,10 +17,10 @@ Labels = NDArray[np.int32]
 def unlabelled_patches(
     depth_m: Array, labels: Labels, least_pixels: int, *, align_px: int
 ) -> tuple[tuple[int, int], Array] | None:
-    """Return the smallest part of the image that holds every unlabelled patch of at least `least_pixels`; None without.
+    """Return the smallest part of the image that holds all unlabelled patches of at least `least_pixels` pixels.
 
-    Patches are connected over sides and corners. Returns the part's first row and column, multiples of `align_px`, and
-    its depth, which is NaN outside these patches.
+    Patches are connected over sides and corners. Returns the part's first row and column, which are multiples of
+    `align_px`, and its depth, which is NaN outside these patches; None if there is no such patch.
     """
     top, left, part = _patches(depth_m, labels, least_pixels, align_px)
     return ((top, left), part) if part.size else None
@@ -28,7 +28,7 @@ def unlabelled_patches(
 
 @compiled
 def _patches(depth: Array, labels: Labels, least: int, align: int) -> tuple[int, int, Array]:
-    """Kernel of `unlabelled_patches`; the depth is empty if there are no patches."""
+    """Return first row, first column and depth of the part that `unlabelled_patches` describes; empty without patches."""
     H, W = depth.shape
     runs, begins = _free_runs(depth, labels)
     parent = _connected(runs, begins)

@@ -1,4 +1,4 @@
-"""Calibration records: where a sensor sits, how its lens bends, what the tool weighs; dated."""
+"""Calibration records: pose of a mounted device, camera intrinsics, tool load; each with date, method and quality."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from hal.strict import Strict, load_toml
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
-CORRELATIONS = 15  # of six axes with one another
-ROUNDING = 1e-4  # of correlations that a person or a file has rounded
+CORRELATIONS = 15  # pairs of six axes
+ROUNDING = 1e-4  # tolerance for correlations that were rounded in the file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraIntrinsics:
-    """Pinhole with the radial-tangential model of Brown and Conrady.
+    """Intrinsics of a pinhole camera with the radial-tangential lens model of Brown and Conrady.
 
     `u = fx x_d + cx` with `x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)`, x = X/Z.
-    OpenCV's order of `distortion`: (k1, k2, p1, p2, k3). Camera axes: x right, y down, z along the
-    view. Pixel (0, 0) is a pixel's centre.
+    `distortion` is in OpenCV's order (k1, k2, p1, p2, k3). Camera axes: x right, y down, z along the view. The integer
+    coordinates (0, 0) are the centre of the upper left pixel.
     """
 
     width_px: int
@@ -39,7 +39,7 @@ class CameraIntrinsics:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ToolLoad:
-    """What hangs below the force/torque sensor, in sensor axes: mass, centre of mass and the sensor's bias."""
+    """Load on the force/torque sensor, in sensor axes: mass and centre of mass of the tool, and the sensor's bias."""
 
     mass_kg: float
     centre_of_mass_m: Vector3
@@ -47,10 +47,10 @@ class ToolLoad:
 
 
 class MountRecord(Strict):
-    """Pose of a device on its parent: fixed-axis roll, pitch, yaw, and one sigma for each of the six axes.
+    """Pose of a device in its parent frame: position, fixed-axis roll, pitch and yaw, and one sigma for each axis.
 
-    `correlations` are those of the six (x, y, z, turns about x, y, z): the lower triangle, row by row, without the
-    diagonal; empty: there are none.
+    `correlations` holds the correlations of the six axes (x, y, z, rotations about x, y, z): the lower triangle of
+    their matrix, row by row, without the diagonal; empty means that there are none.
     """
 
     position_m: Vector3
@@ -70,7 +70,7 @@ class MountRecord(Strict):
         return self
 
     def pose(self) -> UncertainPose:
-        """`parent_from_device` with its covariance."""
+        """Return `parent_from_device` with its covariance (see `hal.geometry`)."""
         sigma = np.array([*self.sigma_m, *self.sigma_rad])
         return UncertainPose(
             parent_from_child=transform_rpy(self.position_m, self.rpy_rad),
@@ -85,7 +85,7 @@ class MountRecord(Strict):
 
 
 class IntrinsicsRecord(Strict):
-    """Lens and image geometry of a camera."""
+    """Intrinsics of a camera, with the RMS reprojection error of the calibration and the one-sigma uncertainties."""
 
     width_px: Annotated[int, Field(ge=1, le=16384)]
     height_px: Annotated[int, Field(ge=1, le=16384)]
@@ -100,7 +100,7 @@ class IntrinsicsRecord(Strict):
     sigma_k1: Annotated[float, Field(ge=0)] = 0.0
 
     def one_sigma_lenses(self) -> tuple[CameraIntrinsics, ...]:
-        """The lens with each of its independent errors one sigma large: focal length, centre x, centre y, k1."""
+        """Return the intrinsics with one parameter at a time off by one sigma: focal length, centre x, centre y, k1."""
         lens = self.intrinsics()
         k1, k2, p1, p2, k3 = lens.distortion
         longer = 1.0 + self.sigma_focal_ratio
@@ -112,14 +112,14 @@ class IntrinsicsRecord(Strict):
         )
 
     def intrinsics(self) -> CameraIntrinsics:
-        """The value type that perception computes with."""
+        """Return the intrinsics as the value type that perception uses."""
         return CameraIntrinsics(
             **self.model_dump(exclude={"rms_px", "sigma_focal_ratio", "sigma_centre_px", "sigma_k1"})
         )
 
 
 class LoadRecord(Strict):
-    """Tool weight and force/torque bias."""
+    """Load of the tool on the force/torque sensor and bias of the sensor, in sensor axes."""
 
     mass_kg: Annotated[float, Field(ge=0)]
     centre_of_mass_m: Vector3
@@ -127,7 +127,7 @@ class LoadRecord(Strict):
     bias_torque_nm: Vector3 = (0.0, 0.0, 0.0)
 
     def load(self) -> ToolLoad:
-        """The value type that motion computes with."""
+        """Return the load as the value type that manipulation uses."""
         return ToolLoad(
             mass_kg=self.mass_kg,
             centre_of_mass_m=self.centre_of_mass_m,
@@ -136,7 +136,7 @@ class LoadRecord(Strict):
 
 
 class CalibrationRecord(Strict):
-    """One calibration file: what was found for one device, when and how well."""
+    """Calibration file of one device: the results, their date, method and quality."""
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
     device: str

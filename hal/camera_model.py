@@ -1,4 +1,4 @@
-"""Project points to pixels and turn pixels into rays: a pinhole with the radial-tangential lens.
+"""Projects points to pixels and converts pixels to rays, for a pinhole camera with a radial-tangential lens model.
 
 Camera axes: x right, y down, z along the view. Pixel (0, 0) is the centre of the upper left pixel.
 Lens model: D. C. Brown, Photogrammetric Engineering 37(8), 1971, in OpenCV's order (k1, k2, p1, p2, k3).
@@ -16,14 +16,14 @@ from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest
 
-NEWTON_STEPS = 20  # quadratic convergence reaches 1e-15 in 4 to 6 for |k1| <= 0.3; the rest serves the image corners
+NEWTON_STEPS = 20  # 4 to 6 steps reach 1e-15 for |k1| <= 0.3; the image corners need more
 
 
 def project(points_camera_m: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2) pixels of (N, 3) points in camera axes; NaN for a point that is not in front of the camera.
+    """Return the (N, 2) pixels of (N, 3) points in camera axes; NaN for a point that is not in front of the camera.
 
     Raises:
-        InvalidRequest: wrong shape.
+        InvalidRequest: the points do not have the shape (N, 3).
     """
     points = _points(points_camera_m, 3)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -32,7 +32,7 @@ def project(points_camera_m: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
 
 
 def project_with_jacobian(points_camera_m: ArrayLike, intrinsics: CameraIntrinsics) -> tuple[Array, Array]:
-    """(N, 2) pixels and their (N, 2, 3) derivatives (px per metre) with respect to the point in camera axes."""
+    """Return the (N, 2) pixels of points and their (N, 2, 3) derivatives (px/m) by the point in camera axes."""
     points = _points(points_camera_m, 3)
     depth = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     normalised = points[:, :2] / depth[:, None]
@@ -47,16 +47,18 @@ def project_with_jacobian(points_camera_m: ArrayLike, intrinsics: CameraIntrinsi
 def disc_offset_px(
     points_m: ArrayLike, radius_m: ArrayLike, camera_from_plate: RigidTransform, intrinsics: CameraIntrinsics
 ) -> Array:
-    """Distance between the middle of a disc's image and the image of its middle, (N, 2) px: the near half looks larger.
+    """Return the offset from the image of a disc's centre to the centre of the disc's image, (N, 2) px.
 
-    The middle of the ellipse is the image of c - r^2 / c_z (a - (n a) n), a the optical axis and n the disc's normal:
-    the pole of the line at infinity by the dual conic r^2 (I - n n^T) - c c^T of the disc (Hartley, Zisserman,
-    Multiple View Geometry, Section 8.3).
+    The offset is not zero because the near half of the disc looks larger.
+
+    The centre of the ellipse is the image of c - r^2 / c_z (a - (n a) n), where c is the disc's centre, r its radius, a
+    the optical axis and n the disc's normal. It is the pole of the line at infinity for the dual conic r^2 (I - n n^T)
+    - c c^T of the disc (Hartley, Zisserman, Multiple View Geometry, Section 8.3).
 
     Args:
-        points_m: (N, 3) middles of discs that lie in the plate (its normal is z), plate frame.
-        radius_m: of each.
-        camera_from_plate: where the plate stands; roughly is enough.
+        points_m: (N, 3) centres of discs that are parallel to the plate, in the plate frame (z is the normal).
+        radius_m: radius of each disc.
+        camera_from_plate: pose of the plate; an approximate one is enough.
     """
     middles = _points(points_m, 3)
     seen_m = camera_from_plate.apply(middles)
@@ -66,7 +68,7 @@ def disc_offset_px(
 
 
 def distort(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2) distorted from ideal normalised coordinates (x = X/Z, y = Y/Z)."""
+    """Return (N, 2) distorted normalised coordinates from ideal ones (x = X/Z, y = Y/Z)."""
     x, y = np.asarray(normalised, float).T
     k1, k2, p1, p2, k3 = intrinsics.distortion
     r2 = x * x + y * y
@@ -81,7 +83,7 @@ def distort(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
 
 
 def distortion_jacobian(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2, 2) derivatives of `distort` with respect to its argument."""
+    """Return the (N, 2, 2) derivatives of `distort` with respect to its argument."""
     x, y = np.asarray(normalised, float).T
     k1, k2, p1, p2, k3 = intrinsics.distortion
     r2 = x * x + y * y
@@ -96,9 +98,9 @@ def distortion_jacobian(normalised: ArrayLike, intrinsics: CameraIntrinsics) -> 
 
 
 def undistort_normalised(distorted: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2) ideal from distorted normalised coordinates, by Newton's method.
+    """Return (N, 2) ideal normalised coordinates from distorted ones, by Newton's method.
 
-    NaN where the lens model has no inverse, that is beyond the radius at which it folds back.
+    They are NaN where the lens model has no inverse, that is, beyond the radius where the distorted radius decreases.
     """
     target = np.asarray(distorted, float)
     if not any(intrinsics.distortion):
@@ -127,37 +129,37 @@ def undistort_normalised(distorted: ArrayLike, intrinsics: CameraIntrinsics) -> 
 
 
 def undistort_pixels(pixels_px: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2) pixels that an ideal pinhole with the same focal lengths and centre would show, of (N, 2) measured ones.
+    """Return the (N, 2) pixels of an ideal pinhole with the same focal lengths and centre, from (N, 2) measured ones.
 
-    NaN where the lens model has no inverse.
+    They are NaN where the lens model has no inverse.
     """
     pixels = _points(pixels_px, 2)
     return _to_pixels(undistort_normalised(_to_normalised(pixels, intrinsics), intrinsics), intrinsics)
 
 
 def normalised_with_jacobian(pixels_px: ArrayLike, intrinsics: CameraIntrinsics) -> tuple[Array, Array]:
-    """(N, 2) ideal normalised coordinates and their (N, 2, 2) derivatives with respect to the measured pixel."""
+    """Return (N, 2) ideal normalised coordinates and their (N, 2, 2) derivatives by the measured pixels."""
     ideal = undistort_normalised(_to_normalised(_points(pixels_px, 2), intrinsics), intrinsics)
     scale = np.array([1.0 / intrinsics.fx_px, 1.0 / intrinsics.fy_px])
     if not any(intrinsics.distortion):
         return ideal, np.broadcast_to(np.diag(scale), (len(ideal), 2, 2)).copy()
     jacobian = distortion_jacobian(ideal, intrinsics)
-    jacobian = np.where(np.isfinite(jacobian), jacobian, np.eye(2))  # a folded point stays NaN in `ideal`
+    jacobian = np.where(np.isfinite(jacobian), jacobian, np.eye(2))  # for `inv`; such a point stays NaN in `ideal`
     return ideal, np.linalg.inv(jacobian) * scale
 
 
 def rays(pixels_px: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 3) unit directions in camera axes through (N, 2) pixels; NaN where the lens model has no inverse."""
+    """Return the (N, 3) unit directions, in camera axes, of (N, 2) pixels; NaN where the lens model has no inverse."""
     ideal = _to_normalised(undistort_pixels(pixels_px, intrinsics), intrinsics)
     directions = np.column_stack([ideal, np.ones(len(ideal))])
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
 def check_size(image: NDArray[Any], intrinsics: CameraIntrinsics) -> None:
-    """Refuse an image whose size is not the calibration's.
+    """Check that an image has the size that the intrinsics are for.
 
     Raises:
-        InvalidRequest: sizes differ.
+        InvalidRequest: the sizes differ.
     """
     if image.shape[:2] != (intrinsics.height_px, intrinsics.width_px):
         raise InvalidRequest(

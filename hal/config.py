@@ -1,4 +1,4 @@
-"""The cell file: which devices make up a cell, where they sit and what limits hold."""
+"""Cell file: the devices of a cell, where they are mounted, and the limits that apply."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class CellSection(Strict):
 
 
 class Mount(Strict):
-    """Where a device sits: on `flange`, `base` or the name of another frame, with a calibration record."""
+    """Mount of a device: parent frame (`flange`, `base` or another frame's name) and calibration record of the pose."""
 
     parent: Name = "flange"
     calibration: Name
@@ -48,7 +48,7 @@ class DeviceSection(Strict):
 
 
 class EmulatorSection(Strict):
-    """`[emulators.NAME]`: the far side of device NAME's wire, worked by another (usually simulated) driver."""
+    """`[emulators.NAME]`: emulates device NAME at the other end of its link, backed by a (usually simulated) device."""
 
     emulator: str
     driver: str
@@ -57,10 +57,10 @@ class EmulatorSection(Strict):
 
 
 class CableSection(Strict):
-    """`[[simulation.cables]]`: a cable before the panel, straight from each point to the next."""
+    """`[[simulation.cables]]`: a cable in front of the panel, straight from each point to the next."""
 
     path_m: Annotated[tuple[Vector3, ...], Field(min_length=2, max_length=50)]
-    """Panel frame."""
+    """Points of the cable's axis, in the panel frame."""
     radius_m: Annotated[float, Field(ge=0.001, le=0.05)] = 0.003
     gray: Annotated[float, Field(ge=0, le=1)] = 0.08
 
@@ -72,7 +72,7 @@ class CableSection(Strict):
 
 
 class SimulationSection(Strict):
-    """`[simulation]`: what the panel file does not know of and a simulated world has nevertheless."""
+    """`[simulation]`: things in the simulated world that the panel file does not describe."""
 
     cables: Annotated[tuple[CableSection, ...], Field(max_length=20)] = ()
 
@@ -87,7 +87,7 @@ class SafetySection(Strict):
 
 
 class WorkspaceSection(Strict):
-    """`[workspace]`: where the panel is expected and how far it may be off; where the arm parks; the floor."""
+    """`[workspace]`: expected pose of the panel with its tolerances, the arm's park position, height of the floor."""
 
     panel_position_m: Vector3
     panel_rpy_rad: Vector3
@@ -98,7 +98,7 @@ class WorkspaceSection(Strict):
 
 
 class CellFile(Strict):
-    """A whole cell file."""
+    """Complete cell file."""
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
     cell: CellSection
@@ -121,7 +121,7 @@ class CellFile(Strict):
 
 
 class Cell(Strict):
-    """A cell file with everything it points to, read and checked."""
+    """Cell file with the panel and the calibration records that it refers to, all validated."""
 
     path: Path
     file: CellFile
@@ -134,38 +134,38 @@ class Cell(Strict):
         return self.file.cell.name
 
     def names_of(self, kind: DeviceKind) -> tuple[str, ...]:
-        """Names of the devices of a kind, in the order of the file."""
+        """Return the names of the devices of a kind, in the order of the file."""
         return tuple(name for name, device in self.file.devices.items() if device.kind is kind)
 
     @property
     def panel_path(self) -> Path:
-        """The panel file.
+        """Path of the panel file.
 
         Raises:
-            ConfigError: it is gone.
+            ConfigError: the file does not exist any more.
         """
         return _locate(self.file.cell.panel, self.path, "cell.panel")
 
     def calibration_path(self, name: str) -> Path:
-        """The file of the calibration record called `name`.
+        """Return the path of the calibration record called `name`.
 
         Raises:
-            ConfigError: its folder is gone.
+            ConfigError: its folder does not exist any more.
         """
         return _locate(self.file.cell.calibrations, self.path, "cell.calibrations") / f"{name}.toml"
 
     @property
     def knowledge_path(self) -> Path | None:
-        """Folder of looks that this cell's own panel adds to the shipped ones; None for none.
+        """Folder of appearance data for this cell's panel, in addition to the shipped data; None if there is none.
 
         Raises:
-            ConfigError: it is gone.
+            ConfigError: the folder does not exist any more.
         """
         folder = self.file.cell.knowledge
         return None if folder is None else _locate(folder, self.path, "cell.knowledge")
 
     def calibration_of(self, device: str) -> CalibrationRecord:
-        """The calibration record of a mounted device.
+        """Return the calibration record of a mounted device.
 
         Raises:
             ConfigError: the device has no mount.
@@ -184,20 +184,21 @@ class Cell(Strict):
 def load_cell(path: Path, *, seed: int | None = None) -> Cell:
     """Read a cell file, its panel and its calibration records.
 
-    Paths inside the file are looked up from the file's folder upwards, so `panels/bench.toml` works from anywhere.
+    A relative path in the file is looked for in the file's folder and then in its parents, so `panels/bench.toml` works
+    whatever the current folder is.
 
     Args:
-        seed: replaces the file's seed.
+        seed: used instead of the file's seed.
 
     Raises:
-        ConfigError: names file, key path and remedy.
+        ConfigError: a file is missing or invalid; names the file, the key path and the remedy.
     """
     file = load_toml(path, CellFile, "cell file")
     if seed is not None:
         file = file.model_copy(update={"cell": file.cell.model_copy(update={"seed": seed})})
     panel = load_panel(_locate(file.cell.panel, path, "cell.panel"))
     bare = Cell.model_construct(path=path, file=file, panel=panel, calibrations={})
-    _ = bare.knowledge_path  # told now, not at the first look
+    _ = bare.knowledge_path  # raises now if the folder is missing, rather than when the first image is taken
     records: dict[str, CalibrationRecord] = {}
     for device, section in file.devices.items():
         if section.mount is not None and section.mount.calibration not in records:

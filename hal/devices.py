@@ -1,10 +1,10 @@
-"""The eight device kinds. Synchronous; every call that touches the device takes a deadline.
+"""Interfaces of the eight device kinds. They are synchronous, and every call that reaches the device takes a deadline.
 
-Common promises (checked by `hal.conformance`):
-- a read returns the newest sample with its stamps and never an old one as new; the stamp and sequence tell;
-- silence raises `DeviceTimeout` before the deadline plus 50 ms; a broken device raises `DeviceFault`; a lost one
-  `DeviceUnavailable`;
-- `health` never blocks on the device; `close` is idempotent and bounded; after it every call raises
+All devices guarantee (checked by `hal.conformance`):
+- a read returns the newest sample; its stamp and sequence show whether it is new;
+- a silent device raises `DeviceTimeout` at the latest 50 ms after the deadline, a broken one `DeviceFault`, and a
+  disconnected one `DeviceUnavailable`;
+- `health` never waits for the device; `close` ends in bounded time, may be called twice, and after it every call raises
   `DeviceUnavailable`.
 """
 
@@ -25,7 +25,7 @@ from hal.readings import Cause, Quality, Stamped
 
 
 class DeviceKind(StrEnum):
-    """The eight kinds."""
+    """The eight device kinds."""
 
     ARM = "arm"
     GRIPPER = "gripper"
@@ -39,7 +39,7 @@ class DeviceKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """What a device's owner knows about it without asking the wire."""
+    """State of a device as its driver knows it, without communicating with the device."""
 
     connected: bool
     quality: Quality
@@ -52,7 +52,7 @@ class Health:
 
 
 class Device(Protocol):
-    """What all kinds share."""
+    """Interface that all kinds share."""
 
     @property
     def name(self) -> str:
@@ -61,15 +61,15 @@ class Device(Protocol):
 
     @property
     def kind(self) -> DeviceKind:
-        """Which of the eight interfaces this is."""
+        """Kind of the device, which states the interface that it implements."""
         ...
 
     def health(self) -> Health:
-        """State of the link and the newest sample; returns at once."""
+        """Return the state of the link and of the newest sample, at once."""
         ...
 
     def close(self) -> None:
-        """Release port and thread; a second call does nothing."""
+        """Release the port and the thread; a second call does nothing."""
         ...
 
 
@@ -85,11 +85,12 @@ class DhLink:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ArmCapabilities:
-    """Kinematics and limits; `flange` is the frame after the last link.
+    """Kinematics and limits of an arm; `flange` is the frame after the last link.
 
-    `link_radius_m` gives, per link, the radius of a capsule round the segment from joint i to joint i + 1, for
-    collision checks. `resolution_rad` is the least step of a joint, measured and commanded, where it matters: an arm
-    with 1.5 mrad moves its tip in steps of a millimetre, and the hand's inertia makes newtons of each.
+    `link_radius_m` gives, per link, the radius of a capsule around the segment from joint i to joint i + 1, for
+    collision checks. `watchdog_s` is the time without set-points after which the drive stops the arm. `resolution_rad`
+    is the smallest step of a joint, measured and commanded, if it matters: steps of 1.5 mrad move the tip by a
+    millimetre each, and the inertia of the hand turns each step into a force of some newtons.
     """
 
     model: str
@@ -107,7 +108,7 @@ class ArmCapabilities:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JointState:
-    """Measured joints, (n,) each. `is_enabled`: drives follow commands."""
+    """Measured joint positions and velocities, (n,) each; `is_enabled` tells whether the drives follow commands."""
 
     position_rad: Array
     velocity_rad_per_s: Array
@@ -117,35 +118,35 @@ class JointState:
 
 @runtime_checkable
 class Arm(Device, Protocol):
-    """A position-controlled serial arm that follows streamed set-points at `command_rate_hz`."""
+    """Position-controlled serial arm that follows set-points streamed at `command_rate_hz`."""
 
     def capabilities(self) -> ArmCapabilities:
-        """Kinematics and limits."""
+        """Return kinematics and limits."""
         ...
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Newest measured joints."""
+        """Return the newest measured joint state."""
         ...
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
-        """Stream one set-point, (n,) rad; returns what was really sent (clipped to limits).
+        """Send one set-point, (n,) rad, and return what was really sent, which is clipped to the limits.
 
-        When set-points stop coming for `watchdog_s`, the drive stops the arm by itself.
+        If no set-point arrives for `watchdog_s`, the drive stops the arm by itself.
         """
         ...
 
     def enable(self, *, deadline: Deadline) -> None:
-        """Let the drives follow commands; the first set-point is the measured position, so nothing moves."""
+        """Make the drives follow commands; the first set-point is the measured position, so the arm does not move."""
         ...
 
     def stop(self, *, deadline: Deadline) -> None:
-        """Decelerate at the limit and refuse commands until `enable`. Allowed from any thread at any time."""
+        """Decelerate at the limit and refuse commands until `enable`; any thread may call this at any time."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GripperCapabilities:
-    """Opening between the pads, from closed to open. `tip_from_flange` geometry is a calibration record."""
+    """Limits of a gripper; its width is the opening between the pads. Its mounting is a calibration record."""
 
     min_width_m: float
     max_width_m: float
@@ -155,7 +156,7 @@ class GripperCapabilities:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GripperState:
-    """Pad opening and grip."""
+    """Opening between the pads, grip force and motion."""
 
     width_m: float
     force_n: float
@@ -168,21 +169,21 @@ class Gripper(Device, Protocol):
     """Parallel gripper."""
 
     def capabilities(self) -> GripperCapabilities:
-        """Range of widths, forces and speeds."""
+        """Return the limits of width, force and speed."""
         ...
 
     def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
-        """Newest width and grip."""
+        """Return the newest width and grip."""
         ...
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
-        """Start to move towards `width_m` with at most `force_n`; returns the width really commanded. Does not wait."""
+        """Start to move to `width_m` with at most `force_n`, without waiting, and return the width really commanded."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraCapabilities:
-    """Image size and the maker's nominal lens; the calibration record has the true one."""
+    """Image size and the manufacturer's nominal intrinsics; the calibration record holds the measured ones."""
 
     width_px: int
     height_px: int
@@ -193,7 +194,7 @@ class CameraCapabilities:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Image:
-    """`pixels`: uint8, (H, W) gray or (H, W, 3) RGB."""
+    """Image; `pixels` are uint8, (H, W) gray or (H, W, 3) RGB."""
 
     pixels: NDArray[np.uint8]
     exposure_s: float
@@ -201,20 +202,20 @@ class Image:
 
 @runtime_checkable
 class Camera(Device, Protocol):
-    """A camera that delivers undistorted-in-time frames (global shutter)."""
+    """Camera that exposes all rows of a frame at the same time (global shutter)."""
 
     def capabilities(self) -> CameraCapabilities:
-        """Size, colour and nominal lens."""
+        """Return image size, colour and nominal intrinsics."""
         ...
 
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
-        """A frame whose exposure began after this call was made."""
+        """Return a frame whose exposure began after this call."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeScannerCapabilities:
-    """Geometry of the range image.
+    """Geometry, limits and noise of a range image.
 
     `pinhole`: point = ((u - cx)/fx z, (v - cy)/fy z, z), z along the view. `orthographic`: fx, fy in pixels per metre,
     point = ((u - cx)/fx, (v - cy)/fy, z). `polar`: one line of `width` beams from `first_angle_rad` in steps of
@@ -237,46 +238,46 @@ class RangeScannerCapabilities:
 
     @property
     def needs_sweep(self) -> bool:
-        """Is one reading only a line, which becomes an image when the wrist sweeps the scanner (`SweptScanner`)?"""
+        """Whether one reading is a single line, so the wrist must sweep the scanner for an image (`SweptScanner`)."""
         return self.projection == "polar"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeImage:
-    """`depth_m`: float32 (height, width), NaN where the sensor saw nothing. Axes as the camera's."""
+    """Range image; `depth_m` is float32 (height, width), NaN where nothing was measured, in the axes of a camera."""
 
     depth_m: NDArray[np.float32]
 
 
 @runtime_checkable
 class RangeScanner(Device, Protocol):
-    """A range scanner."""
+    """Range scanner: a depth camera or a line scanner."""
 
     def capabilities(self) -> RangeScannerCapabilities:
-        """Geometry and limits."""
+        """Return geometry, limits and noise."""
         ...
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:
-        """A range image whose scan began after this call was made."""
+        """Return a range image whose scan began after this call."""
         ...
 
 
 @runtime_checkable
 class SweptScanner(RangeScanner, Protocol):
-    """A line scanner, whose scans are kept one by one while the wrist sweeps it."""
+    """Line scanner that records its scans while the wrist sweeps it."""
 
     def start_recording(self, *, deadline: Deadline) -> None:
-        """Keep every scan that ends from now on; what an earlier recording kept is dropped."""
+        """Record every scan that ends after this call; scans of an earlier recording are discarded."""
         ...
 
     def end_recording(self, *, deadline: Deadline) -> tuple[Stamped[RangeImage], ...]:
-        """Stop keeping scans; returns those kept since `start_recording`, oldest first, each stamped with its end."""
+        """Stop recording and return the scans since `start_recording`, oldest first, each stamped with its end."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProximityCapabilities:
-    """The beam leaves the sensor along +z of its mount; `sigma_m` is the maker's noise figure."""
+    """Range and noise; the beam leaves along +z of the sensor's mount; `sigma_m` is the manufacturer's noise figure."""
 
     min_range_m: float
     max_range_m: float
@@ -289,17 +290,17 @@ class Proximity(Device, Protocol):
     """Distance from a fingertip to the nearest surface along the finger axis."""
 
     def capabilities(self) -> ProximityCapabilities:
-        """Range, noise and rate."""
+        """Return range, noise and rate."""
         ...
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """Newest distance; quality `invalid`, cause `out-of-range`, value NaN when nothing is within range."""
+        """Return the newest distance; NaN, quality `invalid` and cause `out-of-range` if nothing is within range."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TouchCapabilities:
-    """One switch a pad; `channels` names them."""
+    """Touch switches: `channels` names them, one per pad."""
 
     channels: tuple[str, ...]
     threshold_n: float
@@ -311,11 +312,11 @@ class Touch(Device, Protocol):
     """Contact switches on the finger pads and tips."""
 
     def capabilities(self) -> TouchCapabilities:
-        """Channels and threshold."""
+        """Return channels, threshold and rate."""
         ...
 
     def read_contacts(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """Newest state of each channel."""
+        """Return the newest state of each channel."""
         ...
 
 
@@ -332,7 +333,7 @@ class ForceTorqueCapabilities:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Wrench:
-    """Force and torque that the world exerts on the tool, in sensor axes about the sensor's origin; (3,) each."""
+    """Force and torque that the environment exerts on the tool, in sensor axes about the sensor's origin; (3,) each."""
 
     force_n: Array
     torque_nm: Array
@@ -340,14 +341,14 @@ class Wrench:
 
 @runtime_checkable
 class ForceTorque(Device, Protocol):
-    """Wrist force/torque sensor, raw: bias and tool weight are still inside (see `hal.calibration.ToolLoad`)."""
+    """Wrist force/torque sensor; its wrench still contains bias and tool weight (see `hal.calibration.ToolLoad`)."""
 
     def capabilities(self) -> ForceTorqueCapabilities:
-        """Range, noise and rate."""
+        """Return range, noise and rate."""
         ...
 
     def read_wrench(self, *, deadline: Deadline) -> Stamped[Wrench]:
-        """Newest raw wrench."""
+        """Return the newest raw wrench."""
         ...
 
 
@@ -364,15 +365,15 @@ class Lights(Device, Protocol):
     """The panel's border lights."""
 
     def capabilities(self) -> LightsCapabilities:
-        """Channels and how long a lamp takes to settle."""
+        """Return the channels and the time that a lamp takes to settle."""
         ...
 
     def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
-        """Switch all channels; returns what was really commanded."""
+        """Switch all channels and return what was really commanded."""
         ...
 
     def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """Newest feedback of each channel."""
+        """Return the newest feedback of each channel."""
         ...
 
 

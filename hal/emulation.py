@@ -1,4 +1,4 @@
-"""An emulator puts any HAL device on a wire: it answers a real protocol with what the device behind it says."""
+"""Interface of an emulator, which offers any HAL device by a real protocol, so that a real driver can use it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from hal.devices import Device
 
 
 class Emulator(Protocol):
-    """The far side of a wire, running."""
+    """Running emulator at the other end of a driver's link."""
 
     @property
     def address(self) -> dict[str, Any]:
-        """Options that make the real driver find this emulator, e.g. `{"host": "127.0.0.1", "port": 15020}`."""
+        """Driver options that make the real driver find this emulator, e.g. `{"host": "127.0.0.1", "port": 15020}`."""
         ...
 
     def close(self) -> None:
-        """End thread and port; a second call does nothing."""
+        """End the thread and close the port; a second call does nothing."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""The tree of errors; each names the object, the cause and the remedy, and says whether to try again."""
+"""Tree of all errors; each names the object, the cause and the remedy, and states whether to try again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ REINSTALL = "install panelwright anew: `make setup` in a checkout, else `pip ins
 
 
 class Retry(StrEnum):
-    """May the caller send the same request again?"""
+    """Whether the caller may send the same request again."""
 
     SAFE = "safe"
     AFTER_FIX = "after-fix"
@@ -21,8 +21,8 @@ class CellError(Exception):
     """Root of every error that reaches a caller.
 
     Args:
-        what: the thing and the cause, one sentence without a full stop.
-        hint: what to do about it.
+        what: the object and the cause, one sentence without a full stop.
+        hint: the remedy.
         details: facts for programs (plain JSON values), e.g. `{"device": "wrist_ft"}`.
     """
 
@@ -40,12 +40,12 @@ class CellError(Exception):
 
     @property
     def type_name(self) -> str:
-        """Stable name for problem documents and reports, e.g. `device-timeout`."""
+        """Return the stable name for problem documents and reports, e.g. `device-timeout`."""
         name = type(self).__name__
         return "".join("-" + c.lower() if c.isupper() else c for c in name).lstrip("-")
 
     def for_people(self) -> str:
-        """Several lines for a terminal: what, the facts, what to try, whether to retry."""
+        """Return lines for a terminal: the error, its details, the remedy, and whether to retry."""
         lines = [f"{type(self).__name__}: {self.what}"]
         return "\n".join([*lines, *detail_lines(self.details), f"  try    {self.hint}", f"  retry  {self.retry}"])
 
@@ -68,25 +68,25 @@ def _rebuild(kind: type[CellError], what: str, hint: str, details: dict[str, Any
 
 
 class ConfigError(CellError):
-    """A cell, panel or calibration file is wrong; names file and key path."""
+    """A cell, panel or calibration file is wrong; the error names the file and the key path."""
 
     retry = Retry.AFTER_FIX
 
 
 class InvalidRequest(CellError):
-    """The caller asked for something that makes no sense; nothing moved."""
+    """The request makes no sense; nothing moved."""
 
     retry = Retry.AFTER_FIX
 
 
 class Unsupported(CellError):
-    """This backend does not have that capability; another one, in the cell file, may."""
+    """This backend lacks the capability; another one, chosen in the cell file, may have it."""
 
     retry = Retry.AFTER_FIX
 
 
 class DeviceError(CellError):
-    """Something about one device; `details["device"]` names it."""
+    """Error of one device; `details["device"]` names it."""
 
 
 class DeviceUnavailable(DeviceError):
@@ -102,7 +102,7 @@ class DeviceTimeout(DeviceError):
 
 
 class DeviceFault(DeviceError):
-    """The device answered, and says that it is broken."""
+    """The device answered and reports that it is broken."""
 
     retry = Retry.AFTER_FIX
 
@@ -118,7 +118,7 @@ class MotionError(CellError):
 
 
 class MotionRefused(MotionError):
-    """Nothing moved: stopped, no lease, outside limits, or not finite."""
+    """Nothing moved: the cell is stopped, the lease is missing, or a value is outside its limits or not finite."""
 
     retry = Retry.AFTER_FIX
 
@@ -140,24 +140,24 @@ class Cancelled(CellError):
 
 
 class LeaseError(CellError):
-    """Another client holds the cell, or the lease has lapsed."""
+    """Another client holds the lease of the cell, or the lease has expired."""
 
     retry = Retry.AFTER_FIX
 
 
 class PerceptionError(CellError):
-    """The sensors worked, but the answer cannot be given."""
+    """The sensors worked, but their data do not give an answer."""
 
     retry = Retry.SAFE
 
 
 class NotFound(PerceptionError):
-    """The thing looked for is not in the data."""
+    """The object looked for is not in the data."""
 
 
 class Ambiguous(PerceptionError):
-    """More than one answer fits; more data would decide."""
+    """More than one answer fits the data; more data would decide."""
 
 
 class NotObservable(PerceptionError):
-    """The data leave a direction free; the message says which."""
+    """The data do not determine one direction; the message states which."""

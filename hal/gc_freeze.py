@@ -1,4 +1,4 @@
-"""Keep the garbage collector away from what lives as long as the process."""
+"""Excludes objects that live as long as the process from garbage collection."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import gc
 
 
 def freeze_loaded() -> None:
-    """Exclude every object that exists now from later collections; call it once a process has loaded its libraries.
+    """Exclude every existing object from later collections; to be called when a process has loaded its libraries.
 
-    A full collection walks every object of every library and holds the interpreter lock meanwhile. It stopped all
-    threads of a cell process for 46 ms and of a service process for 108 ms of computing time, some twice a minute, and
-    for twice as long on a busy machine.
+    A full collection visits every object of every library and holds the interpreter lock meanwhile. Without this, it
+    stops all threads of a cell process for 46 ms and of a service process for 108 ms of computing time, about twice per
+    minute, and for twice as long on a busy machine.
     """
     gc.freeze()

@@ -33,17 +33,17 @@ Report = Callable[[str, dict[str, Any]], None]
 
 
 class IsolatedDevice:
-    """A device in a process of its own, with the interface of its kind; to close it is to end the process.
+    """Device in a process of its own, with the interface of its kind; closing it ends the process.
 
     When the process ends by itself, every call raises `DeviceUnavailable` at once, and the driver is started again
-    after 0.5 s, then 1 s, and so on up to 5 s. One that cannot connect is tried for ever, since its device may be
-    unplugged; one that crashes for the fourth time within a minute stays down. Motion power does not come back by
-    itself: an arm waits for `enable`, and a gripper, whose jaws may move when it is connected, is not started again.
+    after 0.5 s, then 1 s, and so on up to 5 s. A driver that cannot connect is retried without limit, because its
+    device may be unplugged; one that crashes for the fourth time within a minute stays down. Motion is never resumed
+    automatically: an arm waits for `enable`, and a gripper, whose jaws may move when it is connected, is not restarted.
 
     Args:
-        report: told `driver-down`, `driver-restarted` and `driver-stays-down`, from a thread of this object.
-        pause_s: before the first restart.
-        max_restarts: of a driver that crashes again and again within a minute.
+        report: called with `driver-down`, `driver-restarted` or `driver-stays-down`, from a thread of this object.
+        pause_s: pause before the first restart.
+        max_restarts: how often a driver that keeps crashing is restarted within a minute.
     """
 
     def __init__(
@@ -171,8 +171,8 @@ def isolated_device(
     """Connect a device in a process of its own; see `IsolatedDevice`.
 
     Raises:
-        ConfigError: a simulated driver shares its world with others, and a clock that is not the wall's is no other
-            process's: neither can be isolated.
+        ConfigError: the device cannot be isolated, because a simulated driver shares its world with other devices, and
+            only the wall clock can be shared between processes.
         CellError: the device did not connect.
     """
     if not driver.startswith("sim:") and isinstance(context.clock, WallClock):

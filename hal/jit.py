@@ -1,4 +1,4 @@
-"""The one way to compile a hot loop.
+"""Compiles hot loops; all compiled code of the project uses this decorator.
 
     @compiled
     def sum_of_squares(x: Array) -> float:
@@ -7,8 +7,8 @@
             total += x[i] * x[i]
         return total
 
-A compiled function has Python type annotations, which mypy checks, and is called with one set of argument types only,
-because numba compiles it once more for every other set. The machine code is kept on disk, see `hal.kernel_cache`.
+A compiled function has type annotations, which mypy checks, and must be called with one set of argument types only,
+because numba compiles it again for every other set. The machine code is stored on disk, see `hal.kernel_cache`.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def compiled(*, fastmath: frozenset[str]) -> Callable[[F], F]: ...
 
 
 def compiled(function: F | None = None, /, *, fastmath: frozenset[str] = frozenset()) -> F | Callable[[F], F]:
-    """Compile a function on its first call and keep the result on disk.
+    """Compile a function on its first call and store the machine code on disk.
 
     Division by zero gives infinity or NaN as in numpy. The interpreter lock is released while the function runs.
 
     Args:
         function: the function, when the decorator is used without arguments.
-        fastmath: liberties that the compiler may take with floating-point arithmetic, see `REORDERED`.
+        fastmath: floating-point transformations that the compiler may use, see `REORDERED`.
     """
 
     def compile_one(plain_function: F) -> F:
@@ -55,11 +55,11 @@ def compiled(function: F | None = None, /, *, fastmath: frozenset[str] = frozens
 
 
 def inlined(function: F) -> F:
-    """Let compiled functions call a small helper, which is compiled into each of them and is plain Python elsewhere."""
+    """Let compiled functions call a small helper; it is compiled into each of them and stays plain Python elsewhere."""
     kernel_cache.register_helper(function)
     return register_jitable(error_model="numpy", nogil=True)(function)
 
 
 def as_numpy_scalar(value: T) -> T:
-    """Return `value` as numpy's scalar, because numba compiles a function once more for every Python constant in a call."""
+    """Return `value` as a numpy scalar, because numba compiles a function again for every Python constant in a call."""
     return cast(T, np.asarray(value)[()])

@@ -1,7 +1,7 @@
-"""Where compiled kernels are kept: in one folder for the user, each under a hash of everything that it was compiled from.
+"""Stores compiled kernels in one folder per user, each under a hash of everything that it was compiled from.
 
-A second checkout or installation of the same sources finds them there and compiles nothing. numba's own rule looks at
-the kernel's file only and keeps a kernel whose callee in another file has changed.
+A second checkout or installation of the same sources therefore compiles nothing. numba's own cache checks the kernel's
+file only and would reuse a kernel although a function that it calls in another file has changed.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import numpy as np
 STAMP_DIGITS = 24
 LIMIT_BYTES = 1_000_000_000  # about ten sets of all kernels
 PYTHON = f".py{sys.version_info[0]}{sys.version_info[1]}{sys.abiflags}"
-ENDINGS = tuple(PYTHON + kind for kind in (".nbi", ".1.nbc", ".2.nbc"))  # numba's: index, and one file a signature
-PICKLE_STOP = b"."  # the last byte of every whole file that numba writes
+ENDINGS = tuple(PYTHON + kind for kind in (".nbi", ".1.nbc", ".2.nbc"))  # numba's: index, and one file per signature
+PICKLE_STOP = b"."  # last byte of every complete file that numba writes
 
 _stamps: dict[str, str] = {}
 _expected: dict[str, None] = {}
@@ -35,10 +35,10 @@ _expected: dict[str, None] = {}
 
 @cache
 def folder() -> Path:
-    """Return the folder of the compiled kernels, made when it is not there.
+    """Return the folder of the compiled kernels; it is created if it does not exist.
 
-    It is `NUMBA_CACHE_DIR` or `panelwright/kernels` in the user's cache folder. Where that cannot be written, a private
-    temporary folder takes its place, and every process compiles for itself.
+    It is `NUMBA_CACHE_DIR` or `panelwright/kernels` in the user's cache folder. If that is not writable, a temporary
+    folder of this process is used, so every process compiles its own kernels.
     """
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     caches = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
@@ -53,9 +53,9 @@ def folder() -> Path:
 
 
 class SourceHashLocator:
-    """Tells numba where a function's machine code is kept, and for which sources it is valid.
+    """Tells numba where a function's machine code is stored, and for which sources it is valid.
 
-    numba finds this class by its name, see `hal.jit`, and asks it what its own locators are asked.
+    numba imports this class by the name that `use` sets, and calls it instead of its own locators.
     """
 
     def __init__(self, function: FunctionType, path: str) -> None:
@@ -72,15 +72,15 @@ class SourceHashLocator:
         return locator
 
     def _drop_damaged_files(self) -> None:
-        """Remove files that are empty or cut off, as after a power failure; numba would raise when it reads them."""
+        """Remove files that are empty or cut off, as after a power failure, because numba would fail to read them."""
         for ending in ENDINGS:
             file = folder() / f"{self._name}{ending}"
-            with contextlib.suppress(OSError):  # most often there is no such file
+            with contextlib.suppress(OSError):  # usually there is no such file
                 if not _is_whole(file):
                     file.unlink()
 
     def ensure_cache_path(self) -> None:
-        """Make the folder again if somebody has removed it meanwhile."""
+        """Create the folder again if it was removed in the meantime."""
         folder().mkdir(parents=True, exist_ok=True, mode=0o700)
 
     def get_cache_path(self) -> str:
@@ -88,35 +88,35 @@ class SourceHashLocator:
         return str(folder())
 
     def get_source_stamp(self) -> str:
-        """Return the hash of all sources; numba compiles again what was kept under another one."""
+        """Return the hash of all sources; numba compiles a kernel again if its stored hash differs."""
         return self._stamp
 
     def get_disambiguator(self) -> str:
-        """Return what tells files of functions of the same name apart."""
+        """Return the part of the file name that distinguishes functions of the same name."""
         return f"{self._line}-{self._stamp[:STAMP_DIGITS]}"
 
 
 def stamp_of(module: str, names: Mapping[str, Any], path: Path) -> str:
-    """Hash what the kernels of a module are compiled from.
+    """Return a hash of everything that the kernels of a module are compiled from.
 
-    That is the module's file, the files of compiled functions that it imports and so on, the values of imported
-    constants (they become part of the machine code), and the versions of Python and the compiler.
+    That is the module's file, the files of the compiled functions that it imports, directly or indirectly, the values
+    of imported constants (they become part of the machine code), and the versions of Python and the compiler.
 
     Args:
-        names: the module's names at the time of its first compiled function, when all its imports are done.
+        names: the module's global names when its first function is compiled; by then all its imports are done.
     """
     if module not in _stamps:
-        _stamps[module] = ""  # a circle of imports ends here
+        _stamps[module] = ""  # ends the recursion for circular imports
         parts = [module.encode(), _versions(), path.read_bytes()]
         for name, value in sorted(names.items()):
-            if not name.startswith("__") and (described := _what(value)):  # `__file__` is another one in each checkout
+            if not name.startswith("__") and (described := _what(value)):  # `__file__` differs between checkouts
                 parts.append(f"{name}={described}".encode())
         _stamps[module] = hashlib.sha256(b"\0".join(parts)).hexdigest()
     return _stamps[module]
 
 
 def _what(value: Any) -> str:
-    """Describe a global that a kernel may use; empty for what no kernel can use or what belongs to its own file."""
+    """Return the part of the hash for one global; empty if kernels cannot use it or its own file already covers it."""
     if isinstance(value, ModuleType):
         return _stamps.get(value.__name__, "")
     if isinstance(value, bool | int | float | complex | str | bytes | np.generic):
@@ -129,8 +129,8 @@ def _what(value: Any) -> str:
         members: Mapping[str, enum.Enum] = value.__members__
         return repr([(name, _what(member.value)) for name, member in members.items()])
     if isinstance(value, type):
-        return repr(getattr(value, "_fields", ""))  # of a named tuple
-    function = getattr(value, "py_func", value)  # of a compiled function, else of a helper that others compile in
+        return repr(getattr(value, "_fields", ""))  # a named tuple's fields
+    function = getattr(value, "py_func", value)  # a compiled function has `py_func`; an inlined helper has not
     return _stamps.get(function.__module__, "") if isinstance(function, FunctionType) else ""
 
 
@@ -154,13 +154,13 @@ def expected() -> tuple[str, ...]:
 
 
 def missing(names: Iterable[str]) -> set[str]:
-    """Return those of the names that are not compiled yet."""
+    """Return the names that are not compiled yet."""
     kept = {file.name.removesuffix(ENDINGS[0]) for file in _files() if file.suffix == ".nbi"}
     return set(names) - kept
 
 
 def bound_size(limit_bytes: int = LIMIT_BYTES) -> None:
-    """Remove the files that were written longest ago until the folder is below the limit."""
+    """Remove the oldest files until the folder is below the limit."""
     total, sizes = 0, []
     for file in _files():
         with contextlib.suppress(OSError):
@@ -180,14 +180,14 @@ def _files() -> Iterable[Path]:
 
 
 def use(settings: Any) -> None:
-    """Make numba keep kernels here.
+    """Make numba use this cache.
 
     Args:
-        settings: `numba.config`; `CACHE_LOCATOR_CLASSES` is what `NUMBA_CACHE_LOCATOR_CLASSES` in the environment sets.
+        settings: `numba.config`; the environment variable `NUMBA_CACHE_LOCATOR_CLASSES` sets the same entry.
     """
     settings.CACHE_LOCATOR_CLASSES = f"{__name__}.{SourceHashLocator.__name__}"
 
 
 def register_helper(function: Any) -> None:
-    """Make a helper that is compiled into others part of their hashes."""
+    """Include a helper, which is compiled into other functions, in the hashes of those functions."""
     stamp_of(function.__module__, function.__globals__, Path(function.__code__.co_filename))

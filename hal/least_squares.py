@@ -1,10 +1,10 @@
-"""Minimise a sum of squares by damped Gauss-Newton steps (Levenberg-Marquardt), and refuse what the data leave free.
+"""Minimises a sum of squares by Levenberg-Marquardt steps and refuses problems that the data do not determine.
 
-Residuals are whitened by their covariance, so that the sum is a chi-square and the inverse of J^T J a covariance. The loops
-that run thousands of times per second are compiled and stand where their residuals are.
+Residuals are whitened by their covariance, so that the sum is a chi-square and the inverse of J^T J is a covariance.
+Loops that run thousands of times per second do not use this module; they are compiled together with their residuals.
 
-Source: D. W. Marquardt, J. SIAM 11(2), 1963: the damping is scaled by the diagonal of J^T J, divided by ten after a step that
-lowers the sum and multiplied by ten after one that does not.
+Source: D. W. Marquardt, J. SIAM 11(2), 1963: the damping is scaled by the diagonal of J^T J, divided by ten after a
+step that reduces the sum, and multiplied by ten after one that does not.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from hal.errors import NotObservable
 S = TypeVar("S")
 
 STEPS = 60
-CONVERGED = 1e-10  # predicted fall of chi-square
+CONVERGED = 1e-10  # decrease of chi-square in one step, relative to 1 + chi-square
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Minimum:
-    """The minimum of a sum of squares: chi-square there, the information matrix (n, n) and its inverse."""
+    """Minimum of a sum of squares: chi-square, the information matrix (n, n) and its inverse, the covariance."""
 
     chi_square: float
     information: Array
@@ -36,15 +36,15 @@ class Minimum:
 def descend(
     state: S, linearise: Callable[[S], tuple[Array, Array]], move: Callable[[S, Array], S]
 ) -> tuple[S, Minimum]:
-    """Return the state that minimises |residual|^2, and what is known there.
+    """Return the state that minimises |residual|^2, with chi-square and covariance there.
 
     Args:
-        state: where to start.
-        linearise: whitened residual (m,) and Jacobian (m, n) at a state.
-        move: the state after a step (n,).
+        state: initial state.
+        linearise: returns the whitened residual (m,) and the Jacobian (m, n) at a state.
+        move: returns the state after a step (n,).
 
     Raises:
-        NotObservable: some direction of the state does not show in the residuals at all.
+        NotObservable: the residuals do not depend on some direction of the state.
     """
     residual, jacobian = linearise(state)
     damping = 1e-6
@@ -72,10 +72,10 @@ def descend(
 
 
 def invert(information: Array) -> Array:
-    """Return the inverse of an information matrix, computed after its diagonal is scaled to 1.
+    """Return the inverse of an information matrix, whose diagonal is scaled to 1 for the computation.
 
     Raises:
-        NotObservable: it is singular; `details["direction"]` holds the free direction.
+        NotObservable: the matrix is singular; `details["direction"]` holds the undetermined direction.
     """
     diagonal = np.diag(information)
     if not (np.isfinite(information).all() and (diagonal > 0).all()):

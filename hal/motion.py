@@ -50,9 +50,10 @@ class Guard:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compliance:
-    """Admittance in tool axes (x, y, z, rx, ry, rz): the tool yields to contact wrenches about the declared path.
+    """Admittance in tool axes (x, y, z, rx, ry, rz): contact wrenches make the tool deviate from the declared path.
 
-    mass a + damping v + stiffness x = wrench - target. An axis with stiffness `inf` does not yield.
+    The deviation x obeys mass a + damping v + stiffness x = wrench - target. An axis with stiffness `inf` does not
+    deviate.
     """
 
     stiffness: tuple[float, float, float, float, float, float]
@@ -141,7 +142,7 @@ class MotionLog:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionReport:
-    """The result of a motion. `tripped` names the guard, `device` the failed device; `cause` explains it in a sentence."""
+    """Result of a motion; `tripped` names the guard, `device` the failed device; `cause` explains it in a sentence."""
 
     name: str
     outcome: MotionOutcome

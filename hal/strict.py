@@ -28,7 +28,7 @@ class Fault:
     is_unknown_key: bool = False
 
     def __str__(self) -> str:
-        """Return the fault in one line, with its remedy unless that is a page that covers all faults."""
+        """Return the fault in one line, with its remedy unless the remedy is a page about all faults."""
         said = _said(self.key, self.text)
         return said if self.hint.startswith("see ") or self.hint.endswith(IN_DOCS) else f"{said}; {self.hint}"
 
@@ -44,7 +44,7 @@ class Strict(BaseModel):
 
     @classmethod
     def further_faults(cls, data: dict[str, Any]) -> list[Any]:  # noqa: ARG003 - of use to models that override it
-        """Faults of `data` that validation does not come to when it finds others first, as pydantic gives errors."""
+        """Return faults of `data`, in pydantic's form, that validation does not reach if it finds others first."""
         return []
 
 
@@ -62,7 +62,7 @@ def read_text(path: Path, what: str) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")  # some editors write a byte-order mark before the first key
     except FileNotFoundError:
-        # Their endings are alike and would make any two names look near.
+        # The file endings are equal and would make any two names look similar.
         near = get_close_matches(path.stem, [p.stem for p in path.parent.glob("*.toml")], n=1, cutoff=0.5)
         hint = f"did you mean {path.parent / near[0]}.toml?" if near else f"give the path of a {what} (TOML)"
         raise ConfigError(f"{what} {path} does not exist", hint=hint, file=str(path)) from None
@@ -125,7 +125,7 @@ def _faults(error: ValidationError, data: dict[str, Any], model: type[Strict]) -
     found = error.errors()
     known = {(item["loc"], item["msg"]) for item in found}
     found += [item for item in model.further_faults(data) if (item["loc"], item["msg"]) not in known]
-    # A misspelt key leaves its right one missing: the misspelling is what to mend, so it comes first.
+    # A misspelt key also makes the correct key missing. The misspelling is what must be corrected, so it comes first.
     return [_fault(item, model) for item in sorted(found, key=lambda item: item["type"] != "extra_forbidden")]
 
 
@@ -138,7 +138,7 @@ def _fault(item: Any, model: type[BaseModel]) -> Fault:
     if item["type"] == "missing":
         return Fault(key, "is missing", f"add {key}; {IN_DOCS}")
     given, hint = repr(item.get("input")), item.get("ctx", {}).get("hint")
-    if hint is not None:  # the model knows what helps
+    if hint is not None:  # the model supplies the remedy
         return Fault(key, item["msg"], hint)
     if item["type"] == "value_error":
         return Fault(key, item["msg"].removeprefix("Value error, "), REFERENCE)

@@ -1,4 +1,4 @@
-"""Plain values as TOML text by tomlkit, which escapes what must be escaped and keeps the comments of a text that is edited."""
+"""Writes plain values as TOML text by tomlkit, which escapes strings and preserves the comments of an edited text."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tomlkit.items import AoT, Table
 
 
 def toml_text(data: Mapping[str, Any], *, remarks: Sequence[str] = ()) -> str:
-    """A TOML document of plain values: scalars first, then one table per mapping and one per entry of a list of mappings.
+    """Return a TOML document: scalars first, then one table per mapping and one per entry of a list of mappings.
 
     Args:
-        data: text, truths, finite numbers, lists and mappings; mappings inside a table are written inline.
-        remarks: comments that stand before everything else, one line each.
+        data: strings, booleans, finite numbers, lists and mappings; mappings inside a table are written inline.
+        remarks: comments for the beginning of the document, one line each.
     """
     document = tomlkit.document()
     for remark in remarks:
@@ -24,7 +24,7 @@ def toml_text(data: Mapping[str, Any], *, remarks: Sequence[str] = ()) -> str:
 
 
 def toml_edited(text: str, data: Mapping[str, Any]) -> str:
-    """`text` changed so that it says `data`: what stays the same keeps its place, its way of writing and its comments.
+    """Return `text` edited to contain exactly `data`; unchanged entries keep their position, notation and comments.
 
     Args:
         text: a TOML document.
@@ -39,7 +39,7 @@ def toml_edited(text: str, data: Mapping[str, Any]) -> str:
 
 
 def _put_all(table: MutableMapping[str, Any], data: Mapping[str, Any]) -> None:
-    """Add every entry, those that become tables of their own last: what follows a table's head belongs to it."""
+    """Add every entry, those that become separate tables last, because entries after a table's header belong to it."""
     for key, value in data.items():
         if not _is_table(value) and not _is_tables(value):
             table[key] = _item(value)
@@ -85,7 +85,7 @@ def _table(data: Mapping[str, Any]) -> Table:
 
 
 def _item(value: Any) -> Any:
-    """The value as tomlkit's item; mappings become inline tables."""
+    """Return the value as an item of tomlkit; mappings become inline tables."""
     if isinstance(value, Mapping):
         inline = tomlkit.inline_table()
         for key, part in value.items():
@@ -105,7 +105,7 @@ def _is_tables(value: Any) -> bool:
 
 
 def _is_same(old: Any, value: Any) -> bool:
-    """Whether an item says that value already: 1 and 1.0 are two values, as a strict reader takes them."""
+    """Return whether an item already has the value; 1 and 1.0 differ, as they do for a strict reader."""
     plain = old.unwrap() if hasattr(old, "unwrap") else old
     wanted = list(value) if isinstance(value, tuple) else value
     return type(plain) is type(wanted) and bool(plain == wanted)

@@ -1,4 +1,4 @@
-"""The promises of every device kind as pytest classes; a backend subclasses its kind's contract and supplies a `rig`.
+"""Requirements on every device kind as pytest classes: a backend's tests subclass the contract and supply a `rig`.
 
 ```python
 class TestMyScanner(RangeScannerContract):
@@ -8,7 +8,7 @@ class TestMyScanner(RangeScannerContract):
             yield Rig(device=device, clock=WallClock(), inject=far_side.inject)
 ```
 
-Levels: *static* (what can be said without the wire), *connect*, *read*, *motion* (things move or switch).
+Each test has a level: *static* (needs no communication), *connect*, *read* or *motion* (something moves or switches).
 """
 
 from typing import Any

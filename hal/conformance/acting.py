@@ -1,4 +1,4 @@
-"""What arms, grippers and lights promise: the devices that move or switch something."""
+"""Contracts of arms, grippers and lights, the devices that move or switch something."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from hal.readings import Stamped
 
 
 class ArmContract(DeviceContract[Arm]):
-    """Joint state, streamed set-points, stop."""
+    """Contract of an arm: joint state, streamed set-points, stop."""
 
     kind = DeviceKind.ARM
 
     def read(self, rig: Rig[Arm], duration_s: float = 2.0) -> Stamped[Any]:
-        """Joint state."""
+        """Read the joint state."""
         return rig.device.read_state(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[Arm], value: Any) -> None:
-        """Finite joints within their limits."""
+        """Check that the joint positions are finite and within their limits."""
         capabilities = rig.device.capabilities()
         assert value.position_rad.shape == value.velocity_rad_per_s.shape == (len(capabilities.links),)
         assert np.all(np.isfinite(value.position_rad)) and np.all(np.isfinite(value.velocity_rad_per_s))
@@ -94,16 +94,16 @@ class ArmContract(DeviceContract[Arm]):
 
 
 class GripperContract(DeviceContract[Gripper]):
-    """Width, grip, and commands that are told when clipped."""
+    """Contract of a gripper: width, grip, and commands that return the clipped value."""
 
     kind = DeviceKind.GRIPPER
 
     def read(self, rig: Rig[Gripper], duration_s: float = 2.0) -> Stamped[Any]:
-        """Width and grip."""
+        """Read width and grip."""
         return rig.device.read_state(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[Gripper], value: Any) -> None:
-        """Width within the jaws' range."""
+        """Check that the width is within the range of the jaws."""
         c = rig.device.capabilities()
         assert c.min_width_m - 2e-3 <= value.width_m <= c.max_width_m + 2e-3
         assert math.isfinite(value.force_n)
@@ -136,16 +136,16 @@ class GripperContract(DeviceContract[Gripper]):
 
 
 class LightsContract(DeviceContract[Lights]):
-    """Switched lights with feedback."""
+    """Contract of lights: they switch and report feedback."""
 
     kind = DeviceKind.LIGHTS
 
     def read(self, rig: Rig[Lights], duration_s: float = 2.0) -> Stamped[Any]:
-        """The feedback of all channels."""
+        """Read the feedback of all channels."""
         return rig.device.read_on(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[Lights], value: Any) -> None:
-        """A bool a channel."""
+        """Check that there is one bool per channel."""
         assert len(value) == len(rig.device.capabilities().channels)
         assert all(isinstance(on, bool) for on in value)
 
@@ -169,6 +169,6 @@ class LightsContract(DeviceContract[Lights]):
 
 
 def _inward(arm: Arm, here: Any) -> Any:
-    """Per joint, the direction that leads away from the nearer limit."""
+    """Return for each joint the direction (+1 or -1) away from its nearer limit."""
     c = arm.capabilities()
     return np.where(here > 0.5 * (np.array(c.lower_rad) + np.array(c.upper_rad)), -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""What every device promises, whatever its kind."""
+"""Contract of every device, whatever its kind."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ level = pytest.mark.conformance
 
 
 class DeviceContract(Generic[D]):
-    """Promises that all kinds share; a kind says how to read its newest sample."""
+    """Tests that apply to all kinds; a kind's contract defines how to read its newest sample."""
 
     kind: DeviceKind
 
     @pytest.fixture
     def rig(self) -> Iterator[Rig[D]]:
-        """The backend's device; every subclass supplies its own."""
+        """Yield the connected device under test; every subclass supplies its own."""
         raise NotImplementedError("a conformance class needs a `rig` fixture")
 
     def read(self, rig: Rig[D], duration_s: float = 2.0) -> Stamped[Any]:
-        """One read of the kind's main quantity."""
+        """Read the kind's main quantity once."""
         raise NotImplementedError
 
     def check_value(self, rig: Rig[D], value: Any) -> None:
-        """Is a value of the right type, shape and range?"""
+        """Check that a value has the right type, shape and range."""
         raise NotImplementedError
 
     @level(Level.STATIC)
@@ -115,7 +115,7 @@ class DeviceContract(Generic[D]):
         self.read_until_it_works(rig)
 
     def read_until_it_works(self, rig: Rig[D]) -> None:
-        """Read again and again, at most 5 s on the rig's clock."""
+        """Repeat reading until it succeeds, for at most 5 s on the rig's clock."""
         give_up = rig.deadline(5.0)
         while True:
             try:
@@ -128,6 +128,6 @@ class DeviceContract(Generic[D]):
 
 
 def _device_calls(kind: DeviceKind) -> tuple[str, ...]:
-    """Methods of a kind's interface that go to the wire."""
+    """Return the names of the methods of a kind's interface that communicate with the device."""
     own = vars(PROTOCOLS[kind])
     return tuple(n for n in own if n.startswith(("read_", "command", "set_", "enable", "stop")) and callable(own[n]))

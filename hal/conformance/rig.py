@@ -1,4 +1,4 @@
-"""What a backend brings to the conformance kit."""
+"""Test rig that a backend supplies to the conformance tests."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from hal.devices import Device
 from hal.simulated import Fault
 
 D = TypeVar("D", bound=Device)
-READ_S = 2.0  # generous: a busy machine is not a broken device
+READ_S = 2.0  # long, so that a busy machine is not taken for a broken device
 SLACK_S = 0.05  # how far past its deadline a call may return
-SILENT_READS = 5  # of which the median is judged: a machine that stalls once is no device that is late
+SILENT_READS = 5  # their median is judged, so that one stall of the machine is not taken for a late device
 
 
 class Level(StrEnum):
-    """How far a test goes: each level needs the one before."""
+    """What a test requires of the device; each level includes the previous ones."""
 
     STATIC = "static"
     CONNECT = "connect"
@@ -33,13 +33,14 @@ LEVELS = tuple(Level)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rig(Generic[D]):
-    """A connected device and the means to try it.
+    """Connected device and what the tests need to exercise it.
 
     Attributes:
-        clock: the device's clock; `sleep` lets new samples arrive.
-        sample_period_s: after this long a new sample must be there.
-        inject: begins a fault on the far side (None ends it); None when the backend has no way to do so.
-        may_move: the arm, the gripper or the lights may be worked.
+        clock: the device's clock; its `sleep` lets new samples arrive.
+        sample_period_s: a new sample must arrive within this time.
+        inject: begins a fault in the device or its link, and ends it if called with None; None if the backend has no
+            faults.
+        may_move: whether the tests may move the arm or the gripper, or switch the lights.
     """
 
     device: D
@@ -49,25 +50,25 @@ class Rig(Generic[D]):
     may_move: bool = True
 
     def deadline(self, duration_s: float = READ_S) -> Deadline:
-        """A deadline on the rig's clock."""
+        """Return a deadline on the rig's clock."""
         return Deadline.after(self.clock, duration_s)
 
     def pass_time(self) -> None:
-        """Let a new sample arrive."""
+        """Wait until a new sample has arrived."""
         self.clock.sleep(2.0 * self.sample_period_s)
 
     def begin(self, fault: Fault) -> None:
-        """Inject a fault, or skip the test where the backend cannot."""
+        """Inject a fault, or skip the test if the backend cannot."""
         if self.inject is None:
             pytest.skip(f"this rig has no way to make a device {fault}")
         self.inject(fault)
 
     def end_faults(self) -> None:
-        """Back to normal."""
+        """End the injected fault."""
         if self.inject is not None:
             self.inject(None)
 
     def need_motion(self) -> None:
-        """Skip the test where nothing may move."""
+        """Skip the test if nothing may move."""
         if not self.may_move:
             pytest.skip("this rig may not move anything (level motion was not asked for)")

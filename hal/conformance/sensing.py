@@ -1,4 +1,4 @@
-"""What cameras, range scanners, proximity, touch and force/torque sensors promise."""
+"""Contracts of cameras, range scanners, proximity, touch and force/torque sensors."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from hal.readings import Quality, Stamped
 
 
 class CameraContract(DeviceContract[Camera]):
-    """Frames of the promised size that began after the call."""
+    """Contract of a camera: frames of the stated size whose exposure began after the call."""
 
     kind = DeviceKind.CAMERA
 
     def read(self, rig: Rig[Camera], duration_s: float = 2.0) -> Stamped[Any]:
-        """A frame."""
+        """Read a frame."""
         return rig.device.read_image(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[Camera], value: Any) -> None:
-        """Size, depth and colour as promised."""
+        """Check that size, pixel depth and colour are as the capabilities state."""
         c = rig.device.capabilities()
         shape = (c.height_px, c.width_px, 3) if c.is_colour else (c.height_px, c.width_px)
         assert value.pixels.shape == shape
@@ -38,16 +38,16 @@ class CameraContract(DeviceContract[Camera]):
 
 
 class RangeScannerContract(DeviceContract[RangeScanner]):
-    """Range images in metres with NaN where nothing was seen."""
+    """Contract of a range scanner: range images in metres, NaN where nothing was measured."""
 
     kind = DeviceKind.RANGE_SCANNER
 
     def read(self, rig: Rig[RangeScanner], duration_s: float = 2.0) -> Stamped[Any]:
-        """A range image."""
+        """Read a range image."""
         return rig.device.read_range(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[RangeScanner], value: Any) -> None:
-        """Shape as promised; ranges within the sensor's limits or NaN."""
+        """Check that the shape is as stated and that the ranges are NaN or within the sensor's limits."""
         c = rig.device.capabilities()
         assert value.depth_m.shape == (c.height, c.width)
         assert value.depth_m.dtype == np.float32
@@ -73,16 +73,16 @@ class RangeScannerContract(DeviceContract[RangeScanner]):
 
 
 class ProximityContract(DeviceContract[Proximity]):
-    """A distance, or an invalid reading when nothing is near."""
+    """Contract of a proximity sensor: a distance, or an invalid reading if nothing is in range."""
 
     kind = DeviceKind.PROXIMITY
 
     def read(self, rig: Rig[Proximity], duration_s: float = 2.0) -> Stamped[Any]:
-        """A distance."""
+        """Read the distance."""
         return rig.device.read_distance_m(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[Proximity], value: Any) -> None:
-        """Within the measuring range."""
+        """Check that the distance is within the measuring range."""
         c = rig.device.capabilities()
         assert isinstance(value, float)
         assert c.min_range_m - 5 * c.sigma_m <= value <= c.max_range_m + 5 * c.sigma_m
@@ -94,31 +94,31 @@ class ProximityContract(DeviceContract[Proximity]):
 
 
 class TouchContract(DeviceContract[Touch]):
-    """One switch a channel."""
+    """Contract of touch switches: one state per channel."""
 
     kind = DeviceKind.TOUCH
 
     def read(self, rig: Rig[Touch], duration_s: float = 2.0) -> Stamped[Any]:
-        """All switches."""
+        """Read all switches."""
         return rig.device.read_contacts(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[Touch], value: Any) -> None:
-        """A bool a channel."""
+        """Check that there is one bool per channel."""
         assert len(value) == len(rig.device.capabilities().channels)
         assert all(isinstance(contact, bool) for contact in value)
 
 
 class ForceTorqueContract(DeviceContract[ForceTorque]):
-    """A raw wrench."""
+    """Contract of a force/torque sensor: a raw wrench."""
 
     kind = DeviceKind.FORCE_TORQUE
 
     def read(self, rig: Rig[ForceTorque], duration_s: float = 2.0) -> Stamped[Any]:
-        """A wrench."""
+        """Read the wrench."""
         return rig.device.read_wrench(deadline=rig.deadline(duration_s))
 
     def check_value(self, rig: Rig[ForceTorque], value: Any) -> None:
-        """Finite and within the measuring range."""
+        """Check that the wrench is finite and within the measuring range."""
         c = rig.device.capabilities()
         assert value.force_n.shape == value.torque_nm.shape == (3,)
         assert np.all(np.abs(value.force_n) <= c.force_range_n) and np.all(np.abs(value.torque_nm) <= c.torque_range_nm)

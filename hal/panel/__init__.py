@@ -1,11 +1,11 @@
-"""The panel file: what a panel is. Perception recognises with it, manipulation acts with it, simulators build it.
+"""Panel files: the description of a panel that perception, manipulation and simulation share.
 
-Panel frame: origin in the middle of the plate's front face, x right and y up as the viewer sees it, z out of the plate
-towards the viewer. Angles of needles, levers and knobs are clockwise from straight up as the viewer sees them (so a
-positive angle is a negative turn about z).
+Panel frame: origin at the centre of the plate's front face, x right and y up as the viewer sees it, z out of the plate
+towards the viewer. Angles of needles, levers and knobs are clockwise from straight up as the viewer sees them, so a
+positive angle is a negative rotation about z.
 
-One file a kind of object. Kinds are found by name through the entry-point group `panelwright.kinds` (see `kinds`),
-so that a package can bring further ones.
+There is one module per kind of object. Kinds are found by name through the entry-point group `panelwright.kinds` (see
+`kinds`), so that other packages can add kinds.
 """
 
 from __future__ import annotations

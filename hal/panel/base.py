@@ -1,7 +1,7 @@
-"""What every object on a panel is, and what its kind must say of it.
+"""Base class of all objects on a panel, with what each kind must define.
 
 A kind is a subclass of `PanelObject` with a `kind: Literal[...]` field, registered under that name in the entry-point
-group `panelwright.kinds`. What is said here holds in any state of the object, in the frame of the panel.
+group `panelwright.kinds`. Unless stated otherwise, the geometry holds in any state of the object, in the panel frame.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hal.strict import Strict
 
 
 class PanelObject(Strict, ABC):
-    """An object on the panel. `position_m` is its middle on the plate (x, y)."""
+    """Object on the panel; `position_m` is its centre on the plate (x, y)."""
 
     kind: str
     name: Name
@@ -30,73 +30,73 @@ class PanelObject(Strict, ABC):
     is_round: ClassVar[bool] = False
     """Whether its outline is drawn as a circle where it has no `rim`."""
     asked: ClassVar[tuple[Question, ...]] = ()
-    """What must be asked, beside the name, when a panel with such an object is taught."""
+    """Questions that teaching a panel with such an object must ask, in addition to its name."""
     places_are_lengths: ClassVar[bool] = False
-    """Whether the places of its scale are metres rather than angles."""
+    """Whether the positions on its scale are lengths in metres rather than angles."""
     turns_about_click: ClassVar[bool] = False
-    """Whether teaching takes the place that was clicked for its middle, rather than the middle of its outline."""
+    """Whether teaching uses the clicked point as its centre, rather than the centre of its outline."""
 
     @property
     def point_m(self) -> Vector3:
-        """The middle of the object on the plate, in the panel frame."""
+        """Centre of the object on the plate, in the panel frame."""
         return (self.position_m[0], self.position_m[1], 0.0)
 
     @property
     @abstractmethod
     def face(self) -> Face:
-        """What a picture of it must hold, and the height of the plane that its reader looks at."""
+        """Part of an image that shows the object, and the height of the plane in which its reader looks at it."""
 
     @property
     @abstractmethod
     def half_footprint_m(self) -> Vector2:
-        """Half width and half height of the upright rectangle on the plate that holds it in any state."""
+        """Half width and half height of the upright rectangle on the plate that contains it in any state."""
 
     @property
     def half_foot_m(self) -> Vector2:
-        """Half the sides of what stands on the plate itself, turned as its envelope is; nothing else may stand there."""
+        """Half the sides of the area that it covers on the plate, turned like its envelope; no part may overlap it."""
         return self.half_footprint_m
 
     @abstractmethod
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """The box that holds it in any state, or, if that is smaller, where it stands at `angle_rad`."""
+        """Return the box that contains it in any state or, if that is smaller, at `angle_rad`."""
 
     @property
     def rim(self) -> Rim | None:
-        """The edge that every state shows; None where the panel file leaves the fixed parts open."""
+        """Edge that is visible in every state; None if the panel file does not describe the fixed parts."""
         return None
 
     @property
     def relief(self) -> Relief | None:
-        """How a range image shows it; None where it is not looked for in one."""
+        """Appearance in a range image; None if it is not searched for in range images."""
         return None
 
     @property
     def goal(self) -> Goal | None:
-        """What may be asked of it; None for an object that is only read."""
+        """Goals that it can be set to; None for an object that is only read."""
         return None
 
     @property
     def shown_by(self) -> str:
-        """The name of the object that shows whether this one was worked."""
+        """Name of the object that shows whether operating this one had an effect."""
         return self.name
 
     @property
     def mission_rank(self) -> float | None:
-        """Place among what a mission without orders works: one object of each kind, lowest first; None: left alone."""
+        """Rank in a mission without orders, which operates one object per kind, lowest rank first; None: left out."""
         return None
 
     @property
     def full_scale(self) -> float | None:
-        """The greatest less the least value; None where values have no such range."""
+        """Difference between the largest and the smallest value; None if the values have no such range."""
         return None
 
     @property
     def resting_angles(self) -> Mapping[str, float]:
-        """Angle of each state, rad clockwise from up; empty where states are no angles."""
+        """Angle of each state, rad clockwise from up; empty if the states are not angles."""
         return {}
 
     def is_right(self, said: Shown, truth: Shown) -> bool:
-        """Whether what was said of it is true: states and texts exactly, values within 2 % of full scale."""
+        """Return whether a reading is correct: states and texts must be equal, values within 2 % of full scale."""
         if truth.state is not None:
             return said.state == truth.state
         if truth.text is not None:
@@ -107,5 +107,5 @@ class PanelObject(Strict, ABC):
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """The keys of its table in a panel file, beside kind, name and position, from what was clicked and answered."""
+        """Return the keys of its table in a panel file, except kind, name and position, from what was taught."""
         raise NotImplementedError(f"nothing is known of how to teach a {cls.__name__}")

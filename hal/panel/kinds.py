@@ -1,8 +1,8 @@
-"""Kinds of objects by name: model, reader, skill and simulated body, each found through an entry-point group.
+"""Finds the model, reader, skill and simulated body of a kind of object by name, each through an entry-point group.
 
-A package brings a kind by registering its name in these groups; the product's own kinds are registered in the same way.
-Only the model is needed: a kind without a skill is read only, without a reader it is not read, without a body it cannot
-be simulated.
+A package adds a kind by registering its name in these groups; the built-in kinds are registered in the same way. Only
+the model is required: a kind without a skill is only read, one without a reader is not read, and one without a body
+cannot be simulated.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def kind_model(kind: str) -> type[PanelObject]:
     """Return the model of a kind's objects.
 
     Raises:
-        ConfigError: no such kind (with the nearest known one), its package does not import, or it says another name.
+        ConfigError: there is no such kind (the hint names the nearest one), its package cannot be imported, or its
+            model has another name.
     """
     model: type[PanelObject] = load(KINDS, kind, "kind of object")
     if model.model_fields["kind"].default != kind:
@@ -58,8 +59,8 @@ def part_of(group: str, kind: str) -> Any:
     """Return the reader, skill or body of a kind, depending on the group.
 
     Raises:
-        Unsupported: the kind has none; says what that means.
-        ConfigError: its package does not import.
+        Unsupported: the kind has no such part; the message states the consequence.
+        ConfigError: its package cannot be imported.
     """
     what, meaning = LACKS[group]
     if not has_part(group, kind):

@@ -66,7 +66,7 @@ _OBJECT: TypeAdapter[PanelObject] = TypeAdapter(AnyObject)
 
 
 class Tolerances(Strict):
-    """How far a built panel differs from this file: one sigma each. Only a simulator draws from them."""
+    """Deviations of a built panel from this file, one sigma each; only simulators draw random values from them."""
 
     position_m: NotNegative = 0.0002
     light_m: NotNegative = 0.0001
@@ -74,7 +74,7 @@ class Tolerances(Strict):
 
 
 class Panel(Strict):
-    """One panel: plate, border lights and objects."""
+    """Panel: plate, border lights and objects."""
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
     name: Name
@@ -96,7 +96,7 @@ class Panel(Strict):
 
     @classmethod
     def further_faults(cls, data: dict[str, Any]) -> list[Any]:
-        """Faults of the places of what is right in itself, beside something that is not."""
+        """Return faults in the layout of the parts that are valid by themselves, although other parts are not."""
         parts: dict[Location, Light | PanelObject] = {}
         for key, model in (("lights", TypeAdapter(Light)), ("objects", _OBJECT)):
             table = data.get(key)
@@ -110,10 +110,10 @@ class Panel(Strict):
         return ValidationError.from_exception_data("panel", faults).errors() if faults else []
 
     def object(self, name: str) -> PanelObject:
-        """The object called `name`.
+        """Return the object called `name`.
 
         Raises:
-            InvalidRequest: no such object; says which name is near.
+            InvalidRequest: there is no such object; the hint names the nearest one.
         """
         for panel_object in self.objects:
             if panel_object.name == name:
@@ -130,6 +130,6 @@ def load_panel(path: Path) -> Panel:
     """Read a panel file.
 
     Raises:
-        ConfigError: missing or malformed; names file and key path.
+        ConfigError: the file is missing or malformed; names the file and the key path.
     """
     return load_toml(path, Panel, "panel file")

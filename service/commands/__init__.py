@@ -1,1 +1,1 @@
-"""One file a group of commands; `service.cli` puts them together."""
+"""The commands, one file per group; `service.cli` puts them together."""

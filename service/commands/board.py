@@ -1,4 +1,4 @@
-"""`panelwright calibrate board`: a camera's lens from photographs of a printed board; no cell is needed."""
+"""`panelwright calibrate board`: calibrates a camera's lens from photographs of a printed board, without a cell."""
 
 from __future__ import annotations
 
@@ -18,26 +18,31 @@ if TYPE_CHECKING:
 
 
 class BoardKind(StrEnum):
-    """What is printed."""
+    """Patterns that a board can have."""
 
     CHARUCO = "charuco"
     DOTS = "dots"
 
 
 def board(
-    images: Annotated[list[Path], typer.Argument(help="Photographs of the board, all of one size; ten are good.")],
+    images: Annotated[list[Path], typer.Argument(help="Photographs of the board, all of one size; ten are enough.")],
     *,
     kind: Annotated[
         BoardKind, typer.Option(help="ChArUco (DICT_5X5_100) or a grid of black dots.")
     ] = BoardKind.CHARUCO,
-    columns: Annotated[int, typer.Option(min=3, max=50, help="Squares (dots) in a row.")] = 9,
-    rows: Annotated[int, typer.Option(min=3, max=50, help="Rows.")] = 6,
-    pitch: Annotated[float, typer.Option(min=1e-4, max=1.0, help="Side of a square, or dot to dot, m.")] = 0.03,
+    columns: Annotated[int, typer.Option(min=3, max=50, help="Number of squares (or dots) per row.")] = 9,
+    rows: Annotated[int, typer.Option(min=3, max=50, help="Number of rows.")] = 6,
+    pitch: Annotated[
+        float, typer.Option(min=1e-4, max=1.0, help="Side of a square, or distance between dots, m.")
+    ] = 0.03,
     marker: Annotated[float, typer.Option(min=1e-4, max=1.0, help="Side of a marker, m (ChArUco).")] = 0.022,
     device: Annotated[str, typer.Option(help="Name of the camera in the cell file.")] = "wrist_camera",
-    out: Annotated[Path, typer.Option(help="The record; one that is there keeps its mount and counts up.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="Calibration record to write; if it exists, its mount is kept and its version increased."),
+    ],
 ) -> None:
-    """Focal lengths, centre and distortion, each with one sigma, as a calibration record."""
+    """Calibrate focal lengths, centre and distortion, each with one sigma, and write a calibration record."""
     from hal.calibration import load_calibration
     from perception.calibration import Charuco, Dots, calibrate_camera, record_of, renewed, to_toml
 
@@ -68,10 +73,11 @@ def board(
 
 
 def _views(images: list[Path], target: Charuco | Dots) -> tuple[list[BoardView], tuple[int, int]]:
-    """The board in every image that shows it; the others are named.
+    """Find the board in each image; images without it are named on the terminal.
 
     Raises:
-        InvalidRequest: images of different sizes. NotFound: fewer than three show the board.
+        InvalidRequest: the images differ in size.
+        NotFound: fewer than three images show the board.
     """
     from perception.vision import as_gray
 
@@ -83,12 +89,17 @@ def _views(images: list[Path], target: Charuco | Dots) -> tuple[list[BoardView],
         sizes.setdefault((gray.shape[1], gray.shape[0]), path)
         if len(sizes) > 1:
             words = " and ".join(f"{name.name} {w}x{h}" for (w, h), name in sizes.items())
-            raise InvalidRequest(f"images of different sizes: {words}", hint="one camera, one resolution")
+            raise InvalidRequest(
+                f"images of different sizes: {words}", hint="use images of one camera at one resolution"
+            )
         try:
             found.append(target.find(gray))
         except NotFound as error:
             why = error.what
             console.print(f"left out {path}: {error.what}", markup=False)
     if len(found) < 3:
-        raise NotFound(f"{len(found)} of {len(images)} images show the board; {why}", hint="take ten, tilted every way")
+        raise NotFound(
+            f"{len(found)} of {len(images)} images show the board; {why}",
+            hint="take ten images, with the board tilted in all directions",
+        )
     return found, next(iter(sizes))

@@ -1,6 +1,6 @@
-"""`panelwright calibrate`: the arm drives a sensor through stations that tell most and keeps a dated record.
+"""`panelwright calibrate`: drives a sensor through the most informative stations and stores a dated record.
 
-Works on a simulated cell unless told otherwise, and with `--url` on a running service.
+It starts the shipped simulated cell unless `--cell` names another one or `--url` a running service.
 """
 
 from __future__ import annotations
@@ -19,19 +19,23 @@ from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client
 from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
 
 app = typer.Typer(
-    help="Calibrate: the arm drives through poses, measures, and keeps a versioned, dated record with its quality.",
+    help="Calibrate: the arm drives through poses, measures, and stores a versioned, dated record with its quality.",
     no_args_is_help=True,
 )
 app.command()(board)
-Poses = Annotated[int, typer.Option(min=4, max=40, help="Stations to measure from.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only plan the stations: nothing moves, nothing is written.")]
+Poses = Annotated[int, typer.Option(min=4, max=40, help="Number of stations to measure from.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Only plan the stations; nothing moves and nothing is written.")
+]
 Runs = Annotated[Path, typer.Option(help="Folder of the records: RUNS/calibrations/CELL.")]
-Device = Annotated[str | None, typer.Option(help="Which device; else the first of its kind in the cell file.")]
+Device = Annotated[
+    str | None, typer.Option(help="Device to calibrate; the first of its kind in the cell file if not given.")
+]
 RUNS = Path("runs")
 
 
 def _add_command(what: str, poses_usual: int, summary: str) -> None:
-    """One command a thing to calibrate: they differ in nothing but what is measured and from how many stations."""
+    """Add the command that calibrates `what`; the commands differ only in this and in the number of stations."""
 
     def calibrate(
         *,
@@ -48,13 +52,13 @@ def _add_command(what: str, poses_usual: int, summary: str) -> None:
     app.command(what, help=summary)(calibrate)
 
 
-_add_command("camera", 16, "Lens and mount of a camera whose lens is not known, by the panel's lights.")
-_add_command("hand-eye", 12, "Where the camera sits in the hand and where the panel stands, by the panel's lights.")
+_add_command("camera", 16, "Calibrate lens and mount of a camera whose lens is not known, with the panel's lights.")
+_add_command("hand-eye", 12, "Calibrate the camera's mount in the hand, and the panel's pose, with the panel's lights.")
 _add_command(
-    "scanner", 12, "Where the range scanner sits in the hand, by scans of the plate (calibrate the camera first)."
+    "scanner", 12, "Calibrate the range scanner's mount in the hand by scans of the plate (calibrate the camera first)."
 )
 _add_command(
-    "tool", 12, "Bias of the force/torque sensor, and weight and centre of the tool, with the hand turned every way."
+    "tool", 12, "Calibrate the force/torque sensor's bias and the tool's weight and centre of mass by turning the hand."
 )
 
 
@@ -62,7 +66,7 @@ _add_command(
 def list_records(
     *, cell: CellOption = DEFAULT_CELL, seed: SeedOption = None, runs: Runs = RUNS, url: ServiceUrl = None
 ) -> None:
-    """The records in use: version, date, method, one sigma."""
+    """List the records in use: version, date, method, one sigma."""
     if url is not None:
         entries = client_of(url).get("/v1/calibrations")["calibrations"]
     else:
@@ -79,7 +83,7 @@ def list_records(
 
 
 def _run(what: str, cell: Path, seed: int | None, runs: Path, url: str | None, body: dict[str, Any]) -> None:
-    """One calibration as a task, on a running service or on a cell of our own; ends the process with its code."""
+    """Run a calibration as a task, on a running service or on a cell started for it; ends the process."""
     request = {"what": what, **{key: value for key, value in body.items() if value is not None}}
     run_on_cell(
         lambda client: _follow(client, request), cell=cell, seed=seed, runs=runs, url=url, moves=not body["dry_run"]

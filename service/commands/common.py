@@ -1,4 +1,4 @@
-"""What commands share: the console, where cell files are, options that several have."""
+"""Options and functions that several commands share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.client import DEFAULT_URL, Client
 from service.terminal import console, find_cell
 
 if TYPE_CHECKING:
-    from hal.config import Cell  # imports scipy: a client's command shall not wait for that
+    from hal.config import Cell  # imports scipy, which commands that are only clients do not need
 
 __all__ = [
     "DEFAULT_CELL",
@@ -36,15 +36,15 @@ UrlDefault = DEFAULT_URL
 
 
 def client_of(url: str) -> Client:
-    """A client of the service at `url`."""
+    """Return a client of the service at `url`."""
     return Client(url=url.rstrip("/"))
 
 
 def read_cell(path: Path, seed: int | None) -> Cell:
-    """Load a cell file and check what it needs of this machine.
+    """Load a cell file and check that this machine has everything that it needs.
 
     Raises:
-        ConfigError: file, panel, calibration or machine is not in order.
+        ConfigError: the cell file, the panel file, a calibration record or the machine has a fault.
     """
     from hal.config import load_cell
     from service.commissioning.preflight import check_machine
@@ -55,6 +55,6 @@ def read_cell(path: Path, seed: int | None) -> Cell:
 
 
 def state_style(state: str) -> str:
-    """The colour of a task's state."""
+    """Return the colour of a task's state."""
     styles = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan", "cancelling": "yellow"}
     return styles.get(state, "white")

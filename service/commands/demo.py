@@ -1,4 +1,4 @@
-"""`panelwright demo`: the whole mission on a cell, through the real HTTP server, with a report at the end."""
+"""`panelwright demo`: runs the whole mission on a cell through the HTTP server and writes a report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 from service.commands.warm import compile_first
 
-JUDGE_S = 30  # most that is waited for a verdict
+JUDGE_S = 30  # longest wait for a verdict
 
 
 def demo(
@@ -25,13 +25,13 @@ def demo(
     cell: CellOption = DEFAULT_CELL,
     seed: SeedOption = None,
     judge: Annotated[
-        bool, typer.Option("--judge", help="Afterwards compare the report with the simulator's truth.")
+        bool, typer.Option("--judge", help="Compare the report with the simulator's truth afterwards.")
     ] = False,
     port: Annotated[int, typer.Option(min=0, max=65534, help="HTTP port; 0 takes a free one.")] = 0,
     runs: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("runs"),
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
-    """Run the whole mission and leave a report; exit code 1 when an action was not confirmed."""
+    """Run the whole mission and write a report; the exit code is 1 when an action was not confirmed."""
     from service.serve import Options, Panelwright, exit_on_sigterm
 
     started_s, before = time.monotonic(), reports(runs)
@@ -59,7 +59,7 @@ def demo(
 
 def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
     stop = client.get("/v1/stop")
-    if stop["is_latched"]:  # a cell with real parts starts latched; to run the demo is to say that it is clear
+    if stop["is_latched"]:  # a cell with real devices starts latched; whoever runs the demo states that it is clear
         client.post("/v1/stop/reset", {"seen_count": stop["count"]})
     task = follow(client, client.post("/v1/missions", {})["id"])
     result = task["result"] or {"actions": [], "succeeded": False}
@@ -75,12 +75,12 @@ def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
 
 
 def reported(missions: list[dict[str, Any]], task_id: str) -> str | None:
-    """Name of the mission that was this task; None when it ended before there was anything to report."""
+    """Return the name of the mission that the task ran; None when it ended before there was anything to report."""
     return next((mission["name"] for mission in missions if mission["name"].endswith(f"-{task_id}")), None)
 
 
 def judged(client: Client, mission: str) -> str:
-    """What the judge says of a mission, or why nobody can judge it: the report is worth showing even then."""
+    """Return the verdict on a mission as text, or the reason why it cannot be judged."""
     try:
         task = client.post(f"/v1/judge?wait_s={JUDGE_S}", {"mission": mission})
     except ApiError as error:
@@ -92,14 +92,14 @@ def judged(client: Client, mission: str) -> str:
 
 
 def reports(runs: Path) -> set[Path]:
-    """All reports of a folder."""
+    """Return all reports in a folder."""
     return set(runs.glob("*/report.html"))
 
 
 def _tell_what_is_left(runs: Path, before: set[Path]) -> None:
-    """A mission that was broken off has a report of what it had measured."""
+    """Print the path of the report that an interrupted mission has written."""
     for report in sorted(reports(runs) - before):
-        console.print(f"report of what was measured: [bold]{report}[/]")
+        console.print(f"report of everything measured so far: [bold]{report}[/]")
 
 
 def _actions(actions: list[dict[str, Any]]) -> Table:

@@ -1,4 +1,4 @@
-"""`panelwright conform | emulate | new-driver`: for people who write drivers."""
+"""`panelwright conform | emulate | new-driver`: commands for authors of drivers."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ class LevelChoice(StrEnum):
 
 
 def conform(
-    cell: Annotated[Path, typer.Argument(help="Cell file whose devices are tried.")] = DEFAULT_CELL,
+    cell: Annotated[Path, typer.Argument(help="Cell file whose devices are tested.")] = DEFAULT_CELL,
     *,
-    device: Annotated[list[str] | None, typer.Option(help="Only this device; may be given again.")] = None,
+    device: Annotated[list[str] | None, typer.Option(help="Test only this device; may be given several times.")] = None,
     level: Annotated[
-        LevelChoice, typer.Option(help="How far to go; `motion` works arm, gripper and lights.")
+        LevelChoice, typer.Option(help="Highest level to test; `motion` moves arm and gripper and switches the lights.")
     ] = LevelChoice.READ,
     report: Annotated[
-        Path | None, typer.Option(help="Report without its ending; runs/conform-CELL when not given.")
+        Path | None, typer.Option(help="Path of the report without suffix; runs/conform-CELL if not given.")
     ] = None,
     seed: SeedOption = None,
 ) -> None:
-    """Try the promises of every device kind on the devices of a cell, and write a report (Markdown and JSON)."""
+    """Run the conformance tests on the devices of a cell, and write a report (Markdown and JSON)."""
     from hal.config import load_cell
     from service.commissioning.conform import run
     from service.commissioning.preflight import check_wires
     from service.terminal import find_cell
 
-    loaded = load_cell(find_cell(cell), seed=seed)  # not checked as a whole: a cell that is being built may have no arm
+    loaded = load_cell(find_cell(cell), seed=seed)  # not checked as a whole, because an unfinished cell may have no arm
     check_wires(loaded)
     for name in device or ():
         if name not in loaded.file.devices:
@@ -64,13 +64,13 @@ def emulate(
     *,
     world: Annotated[
         bool,
-        typer.Option("--world", help="With the simulated world behind it: the first wire cell that has such a wire."),
+        typer.Option("--world", help="Connect it to the simulated world of the first wire cell that has such a wire."),
     ] = False,
     cell: Annotated[
-        Path | None, typer.Option("--cell", help="Cell file with emulators; cells/mixed.toml if none is given.")
+        Path | None, typer.Option("--cell", help="Cell file with emulators; cells/mixed.toml if not given.")
     ] = None,
 ) -> None:
-    """Start the far side of a device's wire and say how to reach it, until Ctrl-C."""
+    """Start the emulator of a device's wire, print how to reach it, and serve until Ctrl-C."""
     from hal.registry import Shared
     from service.processes.cell import clock_for, start_emulators
 
@@ -89,7 +89,7 @@ def emulate(
             f"{section.emulator} is up, with {section.driver} of {loaded.path} behind it; a driver finds it by"
         )
         console.print(f"driver = {inline_toml(driver)}\noptions = {inline_toml(address)}", markup=False)
-        while True:  # a simulated device lives in a world that somebody must let pass
+        while True:  # the time of the simulated world passes only while somebody waits
             clock.sleep(1.0 / loaded.file.cell.control_rate_hz)
     finally:
         for close in closers[::-1]:
@@ -97,10 +97,10 @@ def emulate(
 
 
 def find_emulator(name: str, cells: list[Path]) -> tuple[Cell, str]:
-    """The first cell that emulates the device `name`, or a device by the emulator `name`; and that device.
+    """Return the first cell that emulates the device `name`, or that uses the emulator `name`, and the device.
 
     Raises:
-        ConfigError: none does.
+        ConfigError: no cell does.
     """
     known: list[str] = []
     for path in cells:
@@ -116,7 +116,7 @@ def find_emulator(name: str, cells: list[Path]) -> tuple[Cell, str]:
 
 
 def inline_toml(value: Any) -> str:
-    """A value as cell files spell it, on one line."""
+    """Return a value as one line of TOML."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {inline_toml(entry)}" for key, entry in value.items()) + " }"
     if isinstance(value, list | tuple):
@@ -125,17 +125,17 @@ def inline_toml(value: Any) -> str:
 
 
 def new_driver(
-    what: Annotated[str, typer.Argument(help="KIND:NAME, e.g. scanner:foo; the name becomes a module.")],
+    what: Annotated[str, typer.Argument(help="KIND:NAME, e.g. scanner:foo; the name becomes the name of a module.")],
     *,
-    transport: Annotated[str, typer.Option(help="serial or tcp.")] = "serial",
+    transport: Annotated[str, typer.Option(help="Transport: serial or tcp.")] = "serial",
     folder: Annotated[
-        Path, typer.Option(help="panelwright's own tree, or where a package of its own shall be.")
+        Path, typer.Option(help="panelwright's own source tree, or the folder for a separate package.")
     ] = Path(),
     package: Annotated[
-        str | None, typer.Option(help="Name of the package, outside panelwright's tree; panelwright_NAME if not given.")
+        str | None, typer.Option(help="Name of the separate package; panelwright_NAME if not given.")
     ] = None,
 ) -> None:
-    """Write a driver that runs as it is: options, emulator, conformance test, page; then change what the manual says."""
+    """Write a new driver that runs at once (options, emulator, conformance test, page), to be adapted to the device."""
     from service.commissioning.new_driver import parse_kind, write_driver
 
     kind, name = parse_kind(what)

@@ -1,4 +1,4 @@
-"""`panelwright devices …`: look at the devices of a running service, or read, record and replay one of a cell file."""
+"""`panelwright devices …`: shows the devices of a running service, and reads, records and replays single devices."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from service.commands.shutdown import one_interrupt
 if TYPE_CHECKING:
     from service.commissioning.watching import Row
 
-app = typer.Typer(help="Look at devices, read, record and replay them.", invoke_without_command=True)
+app = typer.Typer(help="List, read, watch, record, replay and exchange devices.", invoke_without_command=True)
 err_console = Console(stderr=True, highlight=False, soft_wrap=True)
 Name = Annotated[str, typer.Argument(help="Name of the device in the cell file.")]
-TimeoutOption = Annotated[float, typer.Option(min=0.01, max=60, help="Deadline of each reading.")]
-SAVED = (".png", ".npz")  # a lossy picture would be no measurement
+TimeoutOption = Annotated[float, typer.Option(min=0.01, max=60, help="Deadline of each reading, s.")]
+SAVED = (".png", ".npz")  # lossless formats only, because the files hold measurements
 STYLES = {"valid": "green", "degraded": "yellow", "invalid": "red"}
 
 
 @app.callback()
 def devices(context: typer.Context, url: Url = UrlDefault) -> None:
-    """List the devices when no command is given."""
-    # Given before the command it is meant for it: `devices --url B swap …` went to the service at the usual address.
+    """List the devices if no command is given."""
+    # An option before the command applies to the command: `devices --url B swap …`.
     context.default_map = {name: {"url": url} for name in ("list", "read", "watch", "swap", "connect", "fault")}
     if context.invoked_subcommand is None:
         console.print(_table(client_of(url)))
@@ -42,26 +42,29 @@ def devices(context: typer.Context, url: Url = UrlDefault) -> None:
 
 @app.command("list")
 def list_devices(url: Url = UrlDefault) -> None:
-    """All devices with their health."""
+    """List all devices with their health."""
     console.print(_table(client_of(url)))
 
 
 @app.command("read")
 def read_device(
     name: Name,
-    samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="How many readings.")] = 1,
-    jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object a line.")] = False,
-    save: Annotated[Path | None, typer.Option(help="Write a picture (.png) or array (.npz) instead.")] = None,
-    cell: Annotated[
-        Path | None, typer.Option("--cell", help="Connect the device of this cell file here, without a service.")
+    samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of readings.")] = 1,
+    jsonl: Annotated[bool, typer.Option("--jsonl", help="Print one JSON object per line.")] = False,
+    save: Annotated[
+        Path | None, typer.Option(help="Write the reading to this file, as a picture (.png) or an array (.npz).")
     ] = None,
-    timeout_s: Annotated[float, typer.Option(min=0.01, max=60, help="Deadline of each reading, with --cell.")] = 0.5,
+    cell: Annotated[
+        Path | None,
+        typer.Option("--cell", help="Connect the device of this cell file in this process, without a service."),
+    ] = None,
+    timeout_s: Annotated[float, typer.Option(min=0.01, max=60, help="Deadline of each reading with --cell, s.")] = 0.5,
     url: Url = UrlDefault,
 ) -> None:
     """Read a device of the running service or, with --cell, connect it in this process."""
     if cell is not None:
         if save is not None:
-            raise ConfigError("--save needs a running service, --cell has none", hint="leave out one of the two")
+            raise ConfigError("--save needs a running service and --cell has none", hint="leave out one of the two")
         _read_directly(cell, name, samples=samples, jsonl=jsonl, timeout_s=timeout_s)
         return
     client = client_of(url)
@@ -85,18 +88,18 @@ def _keep(save: Path, data: bytes) -> None:
 
 
 def _form_of(save: Path) -> str:
-    """What the service is asked for to fill a file of that suffix."""
+    """Return the format that the service must send for a file with that suffix."""
     form = save.suffix.lower()
     if form not in SAVED:
         raise InvalidRequest(
-            f"--save {save}: nothing is written as {form or 'a file without suffix'}",
+            f"--save {save}: cannot write {form or 'a file without suffix'}",
             hint=f"suffixes: {', '.join(SAVED)}",
         )
     return form.removeprefix(".")
 
 
 def _read_directly(cell: Path, name: str, *, samples: int, jsonl: bool, timeout_s: float) -> None:
-    """Print samples and errors of one device; exit code 1 when there was no sample at all."""
+    """Print samples and errors of one device; the exit code is 1 when there was no sample."""
     from hal.config import load_cell
     from service.commissioning.direct_read import as_line, read_lines
 
@@ -114,16 +117,19 @@ def _read_directly(cell: Path, name: str, *, samples: int, jsonl: bool, timeout_
 @app.command("record")
 def record_device(
     name: Name,
-    out: Annotated[Path, typer.Argument(help="File to write, JSON lines.")],
+    out: Annotated[Path, typer.Argument(help="File to write (JSON lines).")],
     *,
-    cell: Annotated[Path, typer.Option("--cell", help="Cell file that has the device; connected here, no service.")],
-    seconds: Annotated[float, typer.Option(min=0.1, max=86_400, help="How long.")] = 10.0,
-    jsonl: Annotated[
-        bool, typer.Option("--jsonl", help="Print the samples meanwhile, one JSON object a line.")
-    ] = False,
+    cell: Annotated[
+        Path,
+        typer.Option(
+            "--cell", help="Cell file with the device, which is connected in this process, without a service."
+        ),
+    ],
+    seconds: Annotated[float, typer.Option(min=0.1, max=86_400, help="Duration, s.")] = 10.0,
+    jsonl: Annotated[bool, typer.Option("--jsonl", help="Also print the samples, one JSON object per line.")] = False,
     timeout_s: TimeoutOption = 0.5,
 ) -> None:
-    """Write down all that a device and its driver say to each other."""
+    """Record all traffic between a device and its driver."""
     from hal.config import load_cell
     from service.commissioning.recording import record
 
@@ -133,19 +139,19 @@ def record_device(
     with one_interrupt(), suppress(KeyboardInterrupt):
         for item in items:
             tally.take(item)
-    items.close()  # the device lets go, and the file is whole
+    items.close()  # closes the device and completes the file
     err_console.print(f"{tally}; wrote {out} ({out.stat().st_size / 1024:.0f} KiB)")
-    err_console.print(f"see it again: panelwright devices replay {out}")
+    err_console.print(f"replay it with: panelwright devices replay {out}")
 
 
 @app.command("replay")
 def replay_device(
-    recording: Annotated[Path, typer.Argument(help="File that `record` has written.")],
+    recording: Annotated[Path, typer.Argument(help="File written by `record`.")],
     *,
-    jsonl: Annotated[bool, typer.Option("--jsonl", help="Print the samples, one JSON object a line.")] = False,
+    jsonl: Annotated[bool, typer.Option("--jsonl", help="Print the samples, one JSON object per line.")] = False,
     timeout_s: TimeoutOption = 0.5,
 ) -> None:
-    """Let the recorded device's driver read a recording in the place of the wire, at its pace."""
+    """Run the driver of a recorded device on its recording instead of the wire, at the original pace."""
     from service.commissioning.recording import replay
 
     tally = Tally(jsonl=jsonl)
@@ -156,7 +162,7 @@ def replay_device(
 
 
 class Tally:
-    """Counts samples and errors, and prints them if wanted."""
+    """Counts samples and errors, and prints them as JSON lines if wanted."""
 
     def __init__(self, *, jsonl: bool) -> None:
         self._jsonl = jsonl
@@ -164,19 +170,19 @@ class Tally:
         self._first_s = self._last_s = 0.0
 
     def take(self, item: dict[str, Any]) -> None:
-        """One sample or error."""
+        """Count one sample or error."""
         if self._jsonl:
             _write(item)
         if "error" in item:
             self._errors += 1
             return
-        self._last_s = time.monotonic()  # the samples' own stamps may be of a slower clock
+        self._last_s = time.monotonic()  # the samples' own stamps may come from a slower clock
         self._first_s = self._first_s if self._samples else self._last_s
         self._samples += 1
 
     def __str__(self) -> str:
         lasted_s = self._last_s - self._first_s
-        rate = f" in {lasted_s:.1f} s, {(self._samples - 1) / lasted_s:.0f} a second" if lasted_s > 0.0 else ""
+        rate = f" in {lasted_s:.1f} s, {(self._samples - 1) / lasted_s:.0f} per second" if lasted_s > 0.0 else ""
         return f"{self._samples} samples{rate}, {self._errors} errors"
 
 
@@ -191,13 +197,13 @@ def _write(item: dict[str, Any]) -> None:
 def watch_devices(
     url: Url = UrlDefault,
     *,
-    period_s: Annotated[float, typer.Option(min=0.1, max=60, help="Time between two looks.")] = 1.0,
+    period_s: Annotated[float, typer.Option(min=0.1, max=60, help="Time between two readings, s.")] = 1.0,
     pictures: Annotated[
-        bool, typer.Option(help="Also read cameras and range scanners, which costs a picture.")
+        bool, typer.Option(help="Also read cameras and range scanners, which takes a picture each time.")
     ] = False,
-    count: Annotated[int, typer.Option(min=0, help="Looks until the end; 0: until Ctrl-C.")] = 0,
+    count: Annotated[int, typer.Option(min=0, help="Number of readings; 0 for no limit (until Ctrl-C).")] = 0,
 ) -> None:
-    """Values, rates, ages and error counters of all devices, again and again."""
+    """Show values, rates, ages and error counters of all devices repeatedly."""
     from service.commissioning.watching import Watch
 
     watch, looks = Watch(client_of(url), with_pictures=pictures), 0
@@ -205,11 +211,11 @@ def watch_devices(
         while True:
             try:
                 shown: Table | str = _watched(watch.look())
-            except CellError as error:  # a service that was there may come back
+            except CellError as error:  # a service that answered before may come back
                 if looks == 0:
                     raise
                 shown = f"[red]{escape(error.what)}[/]; try: {escape(error.hint)}"
-            if live is None:  # a log, where nothing can move: every look, as it comes
+            if live is None:  # without a terminal, print each table below the one before
                 console.print(shown)
             else:
                 live.update(shown, refresh=True)
@@ -254,11 +260,11 @@ def _watched(rows: list[Row]) -> Table:
 @app.command("swap")
 def swap_device(
     name: Name,
-    driver: Annotated[str, typer.Argument(help="Another driver, e.g. serial:tfmini.")],
-    options: Annotated[str, typer.Option(help="Its options, as JSON.")] = "{}",
+    driver: Annotated[str, typer.Argument(help="The other driver, e.g. serial:tfmini.")],
+    options: Annotated[str, typer.Option(help="Its options as JSON.")] = "{}",
     url: Url = UrlDefault,
 ) -> None:
-    """Connect another driver in the place of a device while the cell runs."""
+    """Replace a device's driver or options while the cell runs."""
     try:
         block = {"driver": driver, "options": json.loads(options)}
     except ValueError as error:
@@ -268,7 +274,7 @@ def swap_device(
 
 @app.command("connect")
 def connect_device(name: Name, url: Url = UrlDefault) -> None:
-    """Connect a device anew: one that was missing when the cell started, or whose driver stays down."""
+    """Connect a device again that was missing when the cell started, or whose driver has stopped."""
     _show_connected(client_of(url).post(f"/v1/devices/{name}/connect"))
 
 
@@ -282,10 +288,10 @@ def _show_connected(view: dict[str, Any]) -> None:
 def inject_fault(
     name: Name,
     fault: Annotated[str, typer.Argument(help="silent, stale, frozen, biased, disconnected, or none to end it.")],
-    magnitude: Annotated[float, typer.Option(help="Size of a bias.")] = 0.0,
+    magnitude: Annotated[float, typer.Option(help="Size of the bias.")] = 0.0,
     url: Url = UrlDefault,
 ) -> None:
-    """Begin or end a fault in a simulated device."""
+    """Inject a fault into a simulated device, or end it."""
     body = {"fault": None if fault == "none" else fault, "magnitude": magnitude}
     view = client_of(url).post(f"/v1/devices/{name}/fault", body)
     console.print(f"{name}: {view['health']['quality']} ({view['health']['cause']})")

@@ -1,4 +1,4 @@
-"""`panelwright doctor`: what works on this machine, and what to do about the rest."""
+"""`panelwright doctor`: checks the machine and a cell, and says what to do about each fault."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def doctor(
     port: Annotated[int, typer.Option(min=0, max=65534, help="Port that `serve` would use.")] = 8460,
     connect: Annotated[bool, typer.Option(help="Also start the cell and time its devices.")] = True,
 ) -> None:
-    """Check Python, packages, ports, the cell file and its devices; exit code 1 when something is wrong."""
+    """Check Python, packages, ports, the cell file and its devices; the exit code is 1 when something is wrong."""
     from service.commissioning.doctor import examine
 
     if connect:

@@ -1,4 +1,4 @@
-"""`panelwright init`: a folder of one's own with an editable cell."""
+"""`panelwright init`: copies a cell with all its files into a folder for editing."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from service.commands.common import DEFAULT_CELL, console
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(help="Folder for the files; made when it is not there.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the files; created if missing.")],
     *,
-    cell: Annotated[Path, typer.Option("--cell", help="Cell file to start from: a shipped one, or one's own.")] = (
+    cell: Annotated[Path, typer.Option("--cell", help="Cell file to start from, shipped or your own.")] = (
         DEFAULT_CELL
     ),
 ) -> None:
-    """Copy a cell file with its panel, calibration records and taught looks into FOLDER, to be edited there."""
+    """Copy a cell file with its panel, calibration records and taught looks into FOLDER for editing."""
     from service.commissioning.new_cell import copy_cell
 
     copied = copy_cell(cell, folder)

@@ -1,4 +1,4 @@
-"""`panelwright journal`: what was asked, moved and stopped, when and by whom; and whether somebody changed the record."""
+"""`panelwright journal`: shows who asked for, started and stopped what and when, and checks the hash chain."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from service.commands.common import console
 from service.errors import FileFault
 from service.tasks.journal_reader import Record, read_records, verify_chain
 
-WIDTH = 120  # of what a row says; `--json` gives all of it
+WIDTH = 120  # of the text of a row; `--json` gives all of it
 STYLES = {"stop": "red", "task-ended": "green", "journal-dropped": "yellow"}
 
 
 def journal(
     *,
     runs: Annotated[Path, typer.Option(help="Folder of the service: its journal is RUNS/.service.")] = Path("runs"),
-    last: Annotated[int, typer.Option(min=1, help="So many rows, the newest.")] = 30,
+    last: Annotated[int, typer.Option(min=1, help="Number of rows to show, the newest ones.")] = 30,
     kind: Annotated[
-        list[str] | None, typer.Option(help="Only rows of this kind (stop, task-started, …); again for more.")
+        list[str] | None,
+        typer.Option(help="Only rows of this kind (stop, task-started, …); may be given several times."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a row, whole.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print each complete row as one JSON object.")] = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Walk the chain: was a row changed, removed, inserted?")
+        bool, typer.Option("--verify", help="Check the hash chain for changed, removed and inserted rows.")
     ] = False,
 ) -> None:
-    """Show the journal of a service, running or not, oldest row first; times are UTC."""
+    """Show the journal of a running or ended service, oldest row first; times are UTC."""
     path = runs / ".service" / "journal.sqlite"
     if not path.is_file():
         raise FileFault(f"there is no journal {path}", hint="give the service's folder: --runs FOLDER")
@@ -46,7 +47,7 @@ def journal(
             console.print(_line(record))
     if verify:
         count = verify_chain(path)
-        console.print(f"{count} rows, the chain is whole", style="green")
+        console.print(f"{count} rows, the chain is intact", style="green")
 
 
 def _line(record: Record) -> str:
@@ -56,7 +57,7 @@ def _line(record: Record) -> str:
 
 
 def _told(record: Record) -> str:
-    """What a row says, on one line."""
+    """Return the content of a row as one line of text."""
     words = ", ".join(f"{key} {_short(value)}" for key, value in record.data.items() if value is not None)
     words = " ".join(words.split())  # a hint may have several lines
     return words if len(words) <= WIDTH else words[: WIDTH - 1] + "…"

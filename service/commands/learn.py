@@ -1,4 +1,4 @@
-"""`panelwright learn`: the cell looks at its own panel, and blind recognition knows the panel's objects from then on."""
+"""`panelwright learn`: learns what the objects of the cell's own panel look like, for blind recognition."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ def learn(
     *,
     cell: CellOption = DEFAULT_CELL,
     seed: SeedOption = None,
-    runs: Annotated[Path, typer.Option(help="Folder of what is taught: RUNS/knowledge.")] = Path("runs"),
+    runs: Annotated[Path, typer.Option(help="Folder of the service; the looks are stored in RUNS/knowledge.")] = Path(
+        "runs"
+    ),
     url: ServiceUrl = None,
 ) -> None:
     """Locate the panel and learn from one overview what its objects look like, without a click.
 
-    Again when something shows that did not before (a lamp is lit, a lever is open): only what is not known yet is added.
+    Run it again when an object looks different (a lamp is lit, a lever is open); only new looks are added.
     """
     run_on_cell(_learn, cell=cell, seed=seed, runs=runs, url=url)
 
@@ -37,14 +39,16 @@ def _learn(client: Client) -> bool:
 
 
 def tell(learned: LearnResult) -> None:
-    """Print what an overview of a known panel taught."""
+    """Print what was learned from an overview of a known panel."""
     added, seen = learned.added, len(learned.taught_by)
-    looks = ", ".join(f"{name} {count}" for name, count in sorted(added.items())) or "none, everything was known"
+    looks = (
+        ", ".join(f"{name} {count}" for name, count in sorted(added.items())) or "none, because all of them were known"
+    )
     console.print(f"panel [bold]{learned.panel}[/]: {seen} objects looked at; new looks: {looks}")
     console.print(
         f"recognised blind in this overview: {len(learned.known_before)} of {seen} before, {len(learned.known_now)} now"
     )
     for name, why in learned.left_out.items():
-        console.print(escape(f"  {name} taught nothing: {why}"))
+        console.print(escape(f"  nothing was learned from {name}: {why}"))
     if files := [Path(file) for file in learned.files]:
         console.print(escape(f"written  {files[0].parent}: {', '.join(file.name for file in files)}"))

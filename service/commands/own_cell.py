@@ -1,4 +1,4 @@
-"""One task on a running service, or on a cell that is started for it and ended after it."""
+"""Runs one task on a running service, or on a cell that is started for it and closed afterwards."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running 
 
 
 def run_task(client: Client, path: str, request: dict[str, Any]) -> dict[str, Any]:
-    """Start a task and follow it; returns it when it has ended.
+    """Start a task, show its progress, and return it when it has ended.
 
     Raises:
-        KeyboardInterrupt: after the task was cancelled: who presses Ctrl-C in view of an arm wants it to stand.
+        KeyboardInterrupt: Ctrl-C was pressed; the task has been cancelled, which stops the arm.
     """
     task_id = client.post(path, request)["id"]
     try:
         return follow(client, task_id)
     except KeyboardInterrupt:
-        with suppress(ApiError):  # it has ended
+        with suppress(ApiError):  # the task has ended already
             task = client.post(f"/v1/tasks/{task_id}/cancel")
             console.print(f"Ctrl-C: task {task_id} {task['state']}, the arm stops")
         raise
@@ -37,11 +37,11 @@ def run_task(client: Client, path: str, request: dict[str, Any]) -> dict[str, An
 def run_on_cell(
     work: Callable[[Client], bool], *, cell: Path, seed: int | None, runs: Path, url: str | None, moves: bool = True
 ) -> NoReturn:
-    """Do `work` and end the process: 0 when it says that it succeeded, else 1.
+    """Run `work` and end the process, with exit code 0 when `work` returns True, else 1.
 
     Args:
-        cell, seed, runs: of a cell of our own, where no `url` names a running service.
-        moves: clear the stop of the own cell first.
+        cell, seed, runs: options of the cell that is started when `url` is None.
+        moves: whether the task moves the arm, so that the stop of the started cell must be cleared first.
     """
     if url is not None:
         with one_interrupt():
@@ -62,7 +62,7 @@ def run_on_cell(
             panelwright.start()
             client = Client(url=panelwright.url)
             stop = client.get("/v1/stop")
-            if stop["is_latched"] and moves:  # as in `demo`: to run it is to say that the cell is clear
+            if stop["is_latched"] and moves:  # as in `demo`, whoever runs it states that the cell is clear
                 client.post("/v1/stop/reset", {"seen_count": stop["count"]})
             code = 0 if work(client) else 1
         except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""`panelwright range` and `panelwright batch range`: recorded range images to named surfaces."""
+"""`panelwright range` and `panelwright batch range`: find the surfaces in recorded range images."""
 
 from __future__ import annotations
 
@@ -21,23 +21,25 @@ if TYPE_CHECKING:
 
     from perception.range import BatchResult, KeptResults, Match, RangeScene, Reading, Surface
 
-batch = typer.Typer(help="Folders of recordings on many workers (dask).", no_args_is_help=True)
+batch = typer.Typer(help="Process folders of recordings with many workers (dask).", no_args_is_help=True)
 SHOWN_ERRORS = 5
 SHOWN_SURFACES = 25
 
-Scale = Annotated[float | None, typer.Option(help="Metres a unit, instead of what the file says (0.001: mm).")]
-Near = Annotated[float | None, typer.Option(help="Metres at code 0 of 8-bit codes; with --far.")]
-Far = Annotated[float | None, typer.Option(help="Metres at code 255 of 8-bit codes; with --near.")]
-Focal = Annotated[str | None, typer.Option(help="Pinhole sensor: F or FX,FY in pixels.")]
-Centre = Annotated[str | None, typer.Option(help="Pinhole sensor: CX,CY in pixels; the middle by default.")]
-Pitch = Annotated[float | None, typer.Option(help="Orthographic sensor: metres between pixels.")]
+Scale = Annotated[float | None, typer.Option(help="Metres per unit, in place of the file's own unit (0.001 for mm).")]
+Near = Annotated[float | None, typer.Option(help="Distance in metres at code 0 of 8-bit codes; needs --far.")]
+Far = Annotated[float | None, typer.Option(help="Distance in metres at code 255 of 8-bit codes; needs --near.")]
+Focal = Annotated[str | None, typer.Option(help="Focal length of a pinhole sensor: F or FX,FY in pixels.")]
+Centre = Annotated[
+    str | None, typer.Option(help="Centre of a pinhole sensor: CX,CY in pixels; the image's middle by default.")
+]
+Pitch = Annotated[float | None, typer.Option(help="Distance between pixels of an orthographic sensor, m.")]
 
 
 def range_image(
     file: Annotated[Path, typer.Argument(help="Recording: npz, npy, PNG or TIFF.")],
     *,
-    out: Annotated[Path, typer.Option(help="Folder for the results; made if it is not there.")] = Path(),
-    models: Annotated[str | None, typer.Option(help="Look for components: a file of models, or `shipped`.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results; created if missing.")] = Path(),
+    models: Annotated[str | None, typer.Option(help="Also find components: a file of models, or `shipped`.")] = None,
     scale: Scale = None,
     near: Near = None,
     far: Far = None,
@@ -45,7 +47,7 @@ def range_image(
     centre: Centre = None,
     pitch: Pitch = None,
 ) -> None:
-    """Analyse one range image: NAME.surfaces.json, .png (coloured) and .ply (coloured points)."""
+    """Analyse one range image and write NAME.surfaces.json, .png (coloured) and .ply (coloured points)."""
     from perception.range import (
         MARK,
         analyse,
@@ -84,29 +86,33 @@ def range_image(
 def batch_range_images(
     folder: Annotated[Path, typer.Argument(help="Folder of recordings: npz, npy, PNG or TIFF.")],
     *,
-    scheduler: Annotated[str, typer.Option(help='"local", or tcp://host:port of a dask scheduler.')] = "local",
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes of the local scheduler.")] = 2,
-    out: Annotated[Path, typer.Option(help="File for the results: a JSON object a line.")] = Path("surfaces.jsonl"),
+    scheduler: Annotated[
+        str, typer.Option(help='Scheduler: "local", or tcp://host:port of a dask scheduler.')
+    ] = "local",
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes of the local scheduler.")] = 2,
+    out: Annotated[Path, typer.Option(help="File for the results, one JSON object per line.")] = Path("surfaces.jsonl"),
     scale: Scale = None,
     near: Near = None,
     far: Far = None,
     focal: Focal = None,
     centre: Centre = None,
     pitch: Pitch = None,
-    afresh: Annotated[bool, typer.Option("--afresh", help="Drop what a stopped batch has left beside --out.")] = False,
+    afresh: Annotated[
+        bool, typer.Option("--afresh", help="Discard the results that an interrupted batch has left beside --out.")
+    ] = False,
 ) -> None:
-    """Analyse every recording of a folder; ends with 1 when one of them gave no result.
+    """Analyse every recording of a folder; the exit code is 1 when one of them gave no result.
 
-    Ctrl-C stops it; the same command goes on where it was stopped.
+    After Ctrl-C the same command continues where it was interrupted.
     """
     from perception.range import KeptResults, batch_range, recordings_in
 
     reading = _reading(scale, near, far, focal, centre, pitch)
     total = len(recordings_in(folder))
-    _in_folder(out.parent)  # before hours of work, not after
+    _in_folder(out.parent)  # checked before hours of work
     kept = KeptResults(out, folder, reading, afresh=afresh)
     if kept.goes_on:
-        console.print(f"going on with {kept.part}; --afresh would begin anew", markup=False)
+        console.print(f"continuing {kept.part}; --afresh would start again", markup=False)
     compile_first()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     try:
@@ -154,7 +160,7 @@ def _reading(
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:
-    """Two numbers of an option; one number stands for both."""
+    """Return the two numbers of an option; a single number counts as both."""
     try:
         numbers = [float(part) for part in text.split(",")]
         first, second = numbers if len(numbers) > 1 else numbers * 2
@@ -190,7 +196,7 @@ def _print_matches(matches: Sequence[Match]) -> None:
 
 def _print_kept(head: str, kept: KeptResults, total: int) -> None:
     console.print(f"{head}{kept.done} of {total} recordings done, kept in {kept.part}", markup=False)
-    console.print("  try    the same command goes on from there; with --afresh it begins anew", markup=False)
+    console.print("  try    run the same command to continue, or add --afresh to start again", markup=False)
 
 
 def _print_failed(failed: list[BatchResult]) -> None:
@@ -201,7 +207,7 @@ def _print_failed(failed: list[BatchResult]) -> None:
 
 
 def _words(surface: Surface) -> str:
-    """The sizes that tell a surface from others, in millimetres and degrees."""
+    """Return the dimensions that distinguish a surface from others, in millimetres and degrees."""
     from math import degrees
 
     from perception.range import Cone, Cylinder, Ellipsoid, Plane, Sphere

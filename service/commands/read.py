@@ -1,4 +1,4 @@
-"""`panelwright read`: one instrument in a photograph, without a cell and without a service."""
+"""`panelwright read`: reads one instrument in a photograph, without a cell or a service."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RANGE = ".."
 
 
 class InstrumentKind(StrEnum):
-    """Kinds that are read in a photograph."""
+    """Kinds of instruments that can be read in a photograph."""
 
     GAUGE = "gauge"
     DIAL = "dial"
@@ -32,21 +32,27 @@ def read(
     *,
     kind: Annotated[
         InstrumentKind,
-        typer.Option(help="gauge: part of a turn; dial: a full turn from straight up; display: seven segments."),
+        typer.Option(
+            help="gauge: scale over part of a turn; dial: full turn from straight up; display: seven segments."
+        ),
     ],
-    scale: Annotated[str | None, typer.Option(help="Values at the ends of the scale: 0..10.")] = None,
+    scale: Annotated[str | None, typer.Option(help="Values at the ends of the scale, e.g. 0..10.")] = None,
     ends: Annotated[
         str | None,
-        typer.Option(help="Pointer angles there, degrees clockwise from straight up: -135..135; else the ticks tell."),
+        typer.Option(
+            help="Pointer angles at the ends, degrees clockwise from up, e.g. -135..135; read from the ticks if not given."
+        ),
     ] = None,
-    unit: Annotated[str, typer.Option(help="Of the scale.")] = "",
-    scene: Annotated[bool, typer.Option("--scene", help="The display is somewhere in the picture.")] = False,
-    least_confidence: Annotated[float, typer.Option(min=0.0, max=1.0, help="Less sure readings are refused.")] = 0.5,
+    unit: Annotated[str, typer.Option(help="Unit of the scale.")] = "",
+    scene: Annotated[bool, typer.Option("--scene", help="The picture is not cropped to the display.")] = False,
+    least_confidence: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Readings with a lower confidence are refused.")
+    ] = 0.5,
     json: Annotated[bool, typer.Option("--json", help="Print the whole answer as JSON.")] = False,
 ) -> None:
-    """Read one gauge, dial or display in a photograph, with nothing taught but its kind and its scale.
+    """Read one gauge, dial or display in a photograph, of which only the kind and the scale are known.
 
-    Ends with exit code 1 when the instrument cannot be told.
+    The exit code is 1 when the instrument cannot be read.
     """
     ends_deg = _span(ends, "--ends")
     found = read_pixels(
@@ -76,7 +82,7 @@ def _said(found: PhotographReading) -> str:
 
 
 def _span(text: str | None, option: str) -> tuple[float, float] | None:
-    """Two numbers with `..` between them."""
+    """Return the two numbers of a text such as `0..10`."""
     if text is None:
         return None
     first, mark, last = text.partition(RANGE)

@@ -1,4 +1,4 @@
-"""`panelwright serve`: the cell, over HTTP, until Ctrl-C."""
+"""`panelwright serve`: starts a cell and serves it over HTTP until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def serve(
     cell: CellOption = DEFAULT_CELL,
     port: Annotated[int, typer.Option(min=0, max=65534, help="HTTP port; 0 takes a free one.")] = 8460,
     stop_port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Port of the stop process; default: the next one.")
+        int | None, typer.Option(min=0, max=65535, help="Port of the stop process; the port after --port if not given.")
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; without keys only loopback is allowed.")
+        str, typer.Option(help="Address to listen on; only loopback is allowed, because there are no keys.")
     ] = "127.0.0.1",
     runs: Annotated[Path, typer.Option(help="Folder for reports, journal and artefacts.")] = Path("runs"),
     seed: SeedOption = None,
-    warm: Annotated[bool, typer.Option(help="Load the hot loops right after the start.")] = True,
+    warm: Annotated[bool, typer.Option(help="Load the compiled kernels right after the start.")] = True,
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
-    """Start the cell and serve it until Ctrl-C, also while devices are missing."""
+    """Start the cell and serve it until Ctrl-C, even if some devices are missing."""
     from service.serve import Options, Panelwright
 
     check_host(host)
@@ -49,7 +49,7 @@ def serve(
 
 
 def run_to_end(panelwright: Panelwright) -> NoReturn:
-    """Serve until Ctrl-C or SIGTERM, close everything, and leave in bounded time.
+    """Serve until Ctrl-C or SIGTERM, close everything, and end the process in bounded time.
 
     Raises:
         CellError: the cell could not start.
@@ -66,19 +66,19 @@ def run_to_end(panelwright: Panelwright) -> NoReturn:
 
 
 def check_host(host: str) -> None:
-    """Raise `ConfigError` for an address that strangers can reach: there are no keys yet."""
+    """Raise `ConfigError` for an address that other machines can reach, because there are no keys yet."""
     from hal.errors import ConfigError
 
     if host not in LOOPBACK:
         raise ConfigError(
             f"refusing to listen on {host}: anybody there could move the arm",
-            hint="listen on 127.0.0.1 and reach it through ssh -L or a proxy that asks who comes",
+            hint="listen on 127.0.0.1 and reach it through ssh -L or an authenticating proxy",
         )
 
 
 def _announce(panelwright: Panelwright) -> None:
     panelwright.wait_until_settled(START_PATIENCE_S)
-    if panelwright.error is None and not panelwright.is_ending:  # Ctrl-C while it starts: nothing is ready
+    if panelwright.error is None and not panelwright.is_ending:  # not after Ctrl-C during the start
         console.print(f"panelwright: ready at [bold]{panelwright.url}[/]   stop: POST {panelwright.stop_url}")
         for missing in panelwright.service.supervisor.missing:
             console.print(f"panelwright: without [bold]{missing.device}[/]: {escape(missing.why)}")

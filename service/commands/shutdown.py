@@ -1,4 +1,4 @@
-"""The way out of a command."""
+"""Ends the process of a command in a controlled way."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-INTERRUPTED = 128 + signal.SIGINT  # what a shell reports of a program that Ctrl-C ended
+INTERRUPTED = 128 + signal.SIGINT  # the exit code that shells report for a program ended by Ctrl-C
 
 
 def leave(code: int) -> NoReturn:
-    """End this process now. Everything is closed; only a thread that computes could still hold up a usual exit."""
+    """End this process at once. Everything is closed already, but a computing thread could delay a normal exit."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -22,9 +22,9 @@ def leave(code: int) -> NoReturn:
 
 @contextmanager
 def one_interrupt() -> Iterator[None]:
-    """Ctrl-C raises KeyboardInterrupt once: another one would tear the closing of what was begun here.
+    """Let Ctrl-C raise KeyboardInterrupt only once, so that a second one does not interrupt the closing.
 
-    Only for the main thread, as all signal handling.
+    Use it in the main thread only, as all signal handling.
     """
 
     def first(_number: int, _frame: FrameType | None) -> None:

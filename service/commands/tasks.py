@@ -21,7 +21,7 @@ TaskId = Annotated[str, typer.Argument(help="Id of the task, as `task list` show
 
 @app.command("list")
 def list_tasks(url: Url = UrlDefault) -> None:
-    """Kept tasks, newest first."""
+    """List the kept tasks, newest first."""
     table = Table("id", "verb", "state", "progress", "step", "age", box=None, pad_edge=False)
     for task in client_of(url).get("/v1/tasks")["tasks"]:
         style = state_style(task["state"])
@@ -33,13 +33,13 @@ def list_tasks(url: Url = UrlDefault) -> None:
 
 @app.command("show")
 def show_task(task_id: TaskId, url: Url = UrlDefault) -> None:
-    """One task with result and problem, as JSON."""
+    """Show one task with result and problem, as JSON."""
     console.print_json(json.dumps(client_of(url).get(f"/v1/tasks/{task_id}")))
 
 
 @app.command("watch")
 def watch_task(task_id: TaskId, url: Url = UrlDefault) -> None:
-    """Follow a task to its end."""
+    """Show the progress of a task until it ends."""
     try:
         task = follow(client_of(url), task_id)
     except KeyboardInterrupt:
@@ -56,7 +56,7 @@ def cancel_task(task_id: TaskId, url: Url = UrlDefault) -> None:
 
 
 def follow(client: Client, task_id: str) -> dict[str, Any]:
-    """Show a task's progress until it ends; returns the task. In a log, where nothing can move, a line a step."""
+    """Show a task's progress until it ends; returns the task. Without a terminal, print one line per step."""
     (_follow_on_terminal if console.is_terminal else _follow_in_log)(client, task_id)
     task: dict[str, Any] = client.get(f"/v1/tasks/{task_id}")
     console.print(f"task {task_id} [{state_style(task['state'])}]{task['state']}[/]")
@@ -74,7 +74,7 @@ def _follow_on_terminal(client: Client, task_id: str) -> None:
 
 
 def _follow_in_log(client: Client, task_id: str) -> None:
-    begun_s = client.get(f"/v1/tasks/{task_id}")["created_s"]  # whoever comes later sees the same times
+    begun_s = client.get(f"/v1/tasks/{task_id}")["created_s"]  # so that everybody who watches sees the same times
     for event in client.events(task_id):
         if event["kind"] == "progress":
             console.print(
@@ -88,7 +88,7 @@ def _words(event: dict[str, Any]) -> str:
 
 def stop(
     url: Url = UrlDefault,
-    reset: Annotated[bool, typer.Option("--reset", help="Clear the latch instead; moves nothing.")] = False,
+    reset: Annotated[bool, typer.Option("--reset", help="Clear the stop instead; this moves nothing.")] = False,
 ) -> None:
     """Latch the software stop of a running service (not a safety function)."""
     client = client_of(url)

@@ -1,4 +1,4 @@
-"""`panelwright teach`: one image and at most three clicks, or a dialogue, and the system knows a new kind or a panel."""
+"""`panelwright teach`: teaches a kind by at most three clicks in one image, or a kind or panel by a dialogue."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Terminal:
     """Asks a person, or a script on standard input."""
 
     def ask(self, question: Question) -> str:
-        """One line of standard input; the question goes to standard output."""
+        """Print a question on standard output and return one line of standard input."""
         from service.knowledge.dialogue import NobodyAnswers
 
         choices = f" [{'/'.join(question.choices)}]" if question.choices else ""
@@ -41,32 +41,36 @@ class Terminal:
         return line.strip()
 
     def say(self, text: str) -> None:
-        """A line of standard output."""
+        """Print a line on standard output."""
         console.print(text, markup=False)
 
 
 def teach(
-    image: Annotated[Path, typer.Argument(help="Overview of one upright panel with its border in view.")],
+    image: Annotated[Path, typer.Argument(help="Overview of one upright panel with its whole border in view.")],
     *,
-    folder: Annotated[Path, typer.Option(help="Where what is taught is kept; it comes before what is shipped.")] = Path(
-        "runs/knowledge"
-    ),
-    plate: Annotated[str, typer.Option(help="Width,height of the plate, m.")] = "0.60,0.40",
+    folder: Annotated[
+        Path, typer.Option(help="Folder for taught kinds and panels, which take precedence over the shipped ones.")
+    ] = Path("runs/knowledge"),
+    plate: Annotated[str, typer.Option(help="WIDTH,HEIGHT of the plate, m.")] = "0.60,0.40",
     kind: Annotated[str | None, typer.Option(help="Kind of the clicked object; a new name makes a new kind.")] = None,
     click: Annotated[
-        list[str] | None, typer.Option(help="X,Y in pixels; the middle, or two opposite corners, then the middle.")
+        list[str] | None,
+        typer.Option(help="X,Y in pixels: the middle, or two opposite corners, or two corners and then the middle."),
     ] = None,
     from_panel: Annotated[
         Path | None,
-        typer.Option(help="Panel file of the panel in the image: it teaches its own looks, without a click."),
+        typer.Option(help="Panel file of the panel in the image, from which its looks are learned without clicks."),
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only show what is found with what was taught.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only show what is recognised with the present knowledge.")
+    ] = False,
     dialogue: Annotated[
-        bool, typer.Option("--dialogue", help="Ask for everything, also when no person sits at the terminal.")
+        bool, typer.Option("--dialogue", help="Ask questions even if standard input is not a terminal.")
     ] = False,
 ) -> None:
-    """Teach by clicks (--kind), by a panel file (--from-panel), by questions and answers (alone), or show with --check what is
-    found now.
+    """Teach by clicks (--kind), by a panel file (--from-panel), or by a dialogue (without these options).
+
+    With --check nothing is taught, and the command shows what is recognised now.
     """
     from service.knowledge.store import KnowledgeStore
 
@@ -79,7 +83,8 @@ def teach(
     pixels = read_image(image)
     if not (any(ways) or sys.stdin.isatty()):
         raise InvalidRequest(
-            "nobody is there to ask", hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin"
+            "there is no terminal for the dialogue",
+            hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin",
         )
     compile_first()
     store = KnowledgeStore(folder)
@@ -106,7 +111,7 @@ def _by_clicks(
     clicks_px = tuple(_pair(text, "--click") for text in clicks)
     taught = teach_kind(store, pixels, plate_m, kind=kind, clicks_px=clicks_px)
     if not taught.added:
-        console.print(f"{kind} looks like that already: nothing was written", markup=False)
+        console.print(f"this look of {kind} is known already; nothing was written", markup=False)
         return
     console.print(f"wrote {taught.path}", markup=False)
 
@@ -125,7 +130,7 @@ def _by_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], panel_file: Path
 
 
 def read_image(image: Path) -> NDArray[np.uint8]:
-    """Pixels of an image file.
+    """Read the pixels of an image file.
 
     Raises:
         InvalidRequest: it cannot be read, or is no usable image.

@@ -1,4 +1,4 @@
-"""`panelwright warm`, and the same before any command that needs kernels which are not compiled yet."""
+"""`panelwright warm`: compiles the kernels, which is also done before any command that needs them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ err_console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def warm() -> None:
-    """Compile all kernels and keep them on disk, so that the first mission is as fast as the second."""
+    """Compile all kernels and store them on disk, so that the first mission is as fast as later ones."""
     started_s = time.monotonic()
     _compile()
     console.print(f"all kernels are compiled ({time.monotonic() - started_s:.0f} s)")
 
 
 def compile_first() -> None:
-    """Compile what is not compiled yet, with progress on standard error; does nothing most of the time."""
+    """Compile kernels that are not compiled yet, with progress on standard error; usually there are none."""
     from service.compiling import is_compiled
 
     if not is_compiled():
@@ -46,7 +46,7 @@ def _compile() -> None:
 
 
 class Lines:
-    """Progress where nothing can move, as in a log: a line every few seconds."""
+    """Prints progress without a terminal, one line every few seconds."""
 
     def __init__(self) -> None:
         self._told_s = -TICK_S

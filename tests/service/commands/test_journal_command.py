@@ -55,7 +55,7 @@ def test_a_kind_that_no_row_has_is_answered_with_those_there_are(
 
 def test_the_chain_is_whole_until_somebody_changes_a_row(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     journal(runs=runs, verify=True)
-    assert capsys.readouterr().out.endswith("3 rows, the chain is whole\n")
+    assert capsys.readouterr().out.endswith("3 rows, the chain is intact\n")
     with sqlite3.connect(runs / ".service" / "journal.sqlite") as db:
         db.execute("UPDATE journal SET data = '{}' WHERE id = 2")
     with pytest.raises(JournalError, match="the chain breaks at row 2"):

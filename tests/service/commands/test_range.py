@@ -173,7 +173,7 @@ def test_a_batch_goes_on_and_writes_a_line_a_recording_and_tells_of_the_bad_one(
     earlier.add([BatchResult(name="scan_2.npy", scene={"surfaces": []}, error=None)])
     result = run("batch", "range", folder, "--workers", 1, "--out", out, *FOCAL)
     assert result.exit_code == 1 and "3 of 4" in result.output and "scan_9.npz" in result.output
-    assert f"going on with {earlier.part}" in result.output and not earlier.part.exists()
+    assert f"continuing {earlier.part}" in result.output and not earlier.part.exists()
     lines = [json.loads(line) for line in out.read_text().splitlines()]
     assert [line["name"] for line in lines] == ["scan_0.npy", "scan_1.npy", "scan_2.npy", "scan_9.npz"]
     assert lines[0]["scene"] == lines[1]["scene"] and len(lines[0]["scene"]["surfaces"]) == 3

@@ -107,7 +107,7 @@ def test_a_script_that_ends_too_early_or_never_makes_sense_writes_nothing(
         with pytest.raises(InvalidRequest, match=words):
             teach(tmp_path / "panel.png", folder=tmp_path / "kinds", dialogue=True)
     _talk(monkeypatch)
-    with pytest.raises(InvalidRequest, match="nobody is there"):
+    with pytest.raises(InvalidRequest, match="there is no terminal"):
         teach(tmp_path / "panel.png", folder=tmp_path / "kinds")
     with pytest.raises(InvalidRequest, match=r"pane\.png"):  # before it asks
         teach(tmp_path / "pane.png", folder=tmp_path / "kinds")

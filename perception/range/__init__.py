@@ -1,4 +1,4 @@
-"""Range images to named surfaces with covariance, and surfaces to models (paper, Section III)."""
+"""Analysis of range images: surfaces with covariance, and component models found among them (paper, Section III)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One range image in, named surfaces out."""
+"""Analysis of one range image: from depth to surfaces with parameters and covariance."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ Labels = NDArray[np.int32]
 LEAST_VALID_PIXELS = 16
 ICM_SWEEPS = 4
 LEAST_KEPT_PIXELS = 8
-CRUMB_SHARE = 0.5  # of the smallest surface that is looked for
-LARGEST_PIXELS = 2**26  # 8192 x 8192; 6.0 GB at most, measured
+CRUMB_SHARE = 0.5  # least pixels of a surface in the result, relative to the smallest that is searched for
+LARGEST_PIXELS = 2**26  # 8192 x 8192 pixels; their analysis takes up to 6.0 GB of memory (measured)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeScene:
-    """What one range image shows.
+    """The surfaces that one range image shows.
 
     Attributes:
         labels: (H, W) int32, label of the surface at each pixel, 0 = none.
-        surfaces: largest first, parameters in the sensor frame; `surfaces[i].label` indexes `labels`.
+        surfaces: largest first, parameters in the sensor frame; `surfaces[i].label` is a value of `labels`.
         noise: the noise model that was estimated from the image, or given.
         sensor: the sensor model used.
-        warnings: plain sentences about what limits this result.
+        warnings: sentences about what limits the accuracy or completeness of this result.
     """
 
     labels: Labels
@@ -51,15 +51,15 @@ class RangeScene:
     warnings: tuple[str, ...]
 
     def features(self) -> tuple[RangeFeature, ...]:
-        """Planes, axes and points with covariance, one a surface, for fusion."""
+        """Return one feature per surface (plane, axis or point) with covariance, for fusion."""
         return features_of(self.surfaces)
 
     def of_type(self, kind: SurfaceType) -> tuple[Surface, ...]:
-        """The surfaces of one type, largest first."""
+        """Return the surfaces of one type, largest first."""
         return tuple(s for s in self.surfaces if s.type == kind)
 
     def largest_plane(self) -> Surface:
-        """The plane with the most pixels.
+        """Return the plane with the most pixels.
 
         Raises:
             NotFound: the image shows no plane.
@@ -83,9 +83,9 @@ def analyse(
     Args:
         depth_m: (H, W) depth along the sensor's z axis, metres; NaN, infinite or <= 0 (pinhole) = no reading.
         sensor: pinhole or orthographic model of that size.
-        noise: used instead of the estimate from the image when given.
-        tiles: horizontal tiles that share the work on pixels; the result is the same for any number.
-        pool: threads to run the tiles on.
+        noise: noise model to use instead of an estimate from the image.
+        tiles: number of horizontal tiles in which pixels are processed; the result does not depend on it.
+        pool: threads that process the tiles.
 
     Raises:
         InvalidRequest: wrong shape or type, a sensor of another size, or depth that cannot be metres.
@@ -106,9 +106,9 @@ def analyse(
 
 
 def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> tuple[Array, Array]:
-    """The depth image as (H, W) float64 with NaN for every kind of missing reading, and its `typical_depths_m`.
+    """Return the depth image as (H, W) float64, with NaN for every missing reading, and its `typical_depths_m`.
 
-    See `analyse` for errors.
+    Raises the same errors as `analyse`.
     """
     raw = np.asarray(depth_m)
     if raw.ndim != 2 or raw.dtype.kind not in "fiu":
@@ -136,7 +136,7 @@ def checked_depth(depth_m: ArrayLike, sensor: RangeSensorModel) -> tuple[Array, 
 
 @compiled
 def _drop_missing(depth: Array, least: float) -> int:
-    """Turn what is not finite or not beyond `least` into NaN; returns how many readings remain."""
+    """Replace readings that are not finite or not above `least` by NaN; returns the number of readings that remain."""
     flat = depth.ravel()
     valid = 0
     for i in range(flat.shape[0]):
@@ -148,6 +148,7 @@ def _drop_missing(depth: Array, least: float) -> int:
 
 
 def _check_scale(middle: float, sensor: RangeSensorModel) -> None:
+    """Raise InvalidRequest if the median depth shows that the image is not in metres."""
     if abs(middle) > 200.0:
         raise InvalidRequest(
             f"median depth is {middle:.0f} m: the image is probably in millimetres",
@@ -161,7 +162,7 @@ def _check_scale(middle: float, sensor: RangeSensorModel) -> None:
 
 
 def _grouped(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) -> Regions:
-    """Regions after neighbours and pieces of one surface were joined."""
+    """Build the regions of the labels after touching parts and separated pieces of one surface have been merged."""
     packed, law = task.packed, noise.packed()
     regions = regions_of(task.depth_m, packed, law, labels, len(found.kinds))
     regions = regions.given_to(merge.merge_touching(regions, found.kinds, found.parameters))
@@ -169,6 +170,7 @@ def _grouped(task: Task, noise: NoiseModel, labels: Labels, found: Candidates) -
 
 
 def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates) -> tuple[Labels, tuple[Surface, ...]]:
+    """Refine all surfaces on their pixels, largest first, assign the pixels at borders, and drop tiny surfaces."""
     depth, packed, law = task.depth_m, task.packed, noise.packed()
     pixels = regions.pixels
     keep = sorted((k for k, n in enumerate(pixels, 1) if n >= LEAST_KEPT_PIXELS), key=lambda k: -pixels[k - 1])
@@ -188,6 +190,7 @@ def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates
 def _warnings(
     depth: Array, middle: float, sensor: RangeSensorModel, noise: NoiseModel, surfaces: tuple[Surface, ...]
 ) -> tuple[str, ...]:
+    """Return a sentence for each finding that makes the result less reliable."""
     doubt = doubt_about(depth, sensor)
     out = [] if doubt is None else [f"the sensor model seems wrong: {doubt}"]
     sigma = noise.sigma_of(middle)

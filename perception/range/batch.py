@@ -1,8 +1,8 @@
-"""Thousands of recorded scans on dask.distributed: the same result whatever the number of workers.
+"""Analysis of thousands of recordings on dask.distributed; the result does not depend on the number of workers.
 
-A task holds at least 20 images, because handing one over costs about as much as a tenth of an image. A worker that is
-lost is replaced and its tasks run again; an image that cannot be read becomes a result with its error. What a task gave
-is kept as soon as it ends.
+A task has at least 20 images, because its transfer costs about as much as a tenth of an image. A worker that dies is
+replaced and its tasks run again; an image that cannot be read gives a result with the error. The results of a task are
+saved as soon as it ends.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from perception.range.batch_results import BatchResult, KeptResults
 from perception.range.recordings import AS_FILED, SUFFIXES, Reading, load_recording
 from perception.range.render import MARK, scene_json
 
-IMAGES_A_TASK = 20
-RETRIES = 3
-LOOK_S = 10.0  # how often the scheduler is asked whether anybody still works
-ALONE_LOOKS = 6  # looks without any worker that end the batch: a replacement is up within seconds
+IMAGES_A_TASK = 20  # least number of images per task
+RETRIES = 3  # of a task whose worker died
+LOOK_S = 10.0  # interval at which the scheduler is asked whether it still has workers
+ALONE_LOOKS = 6  # successive intervals without any worker that end the batch; a worker is replaced within seconds
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """The recordings of a folder, in the order of their names; pictures that `panelwright range` drew are left out.
+    """Return the recordings of a folder in the order of their names, without the pictures that were drawn of them.
 
     Raises:
         InvalidRequest: there is no such folder, or it holds no recording.
@@ -44,24 +44,25 @@ def recordings_in(folder: Path) -> list[Path]:
 
 
 def analyse_files(paths: Sequence[str], reading: Reading = AS_FILED) -> list[BatchResult]:
-    """Analyse recordings one after the other: what one task does on a worker."""
+    """Analyse recordings one after the other, as one task on a worker."""
     return [_one(Path(path), reading) for path in paths]
 
 
 def _one(path: Path, reading: Reading) -> BatchResult:
+    """Analyse one recording; an error becomes part of the result."""
     try:
         depth, sensor = load_recording(path, reading=reading)
         scene = analyse(depth, sensor)
     except CellError as error:
         return BatchResult(name=path.name, scene=None, error=f"{type(error).__name__}: {error.what}")
     except Exception as defect:
-        # A defect of ours on one image must not cost the others theirs.
+        # A defect of the program on one image must not cost the results of the others.
         return BatchResult(name=path.name, scene=None, error=f"Defect: {type(defect).__name__}: {defect}")
     return BatchResult(name=path.name, scene=scene_json(scene), error=None)
 
 
 def tasks_of(paths: Sequence[Path], images_a_task: int = IMAGES_A_TASK) -> list[list[str]]:
-    """Paths in groups of `images_a_task`; the last group takes the rest, so none is smaller."""
+    """Divide paths into groups of at least `images_a_task`; all groups are of about the same size."""
     count = max(1, len(paths) // max(images_a_task, 1))
     names = [str(p) for p in paths]
     return [names[len(names) * k // count : len(names) * (k + 1) // count] for k in range(count)]
@@ -82,15 +83,16 @@ def batch_range(
         scheduler: "local" starts `workers` processes here; "tcp://host:port" uses a running dask scheduler, whose
             workers must see the folder under the same path.
         reading: what the files do not say, as for `load_recording`.
-        progress: called with images done and images in all: after each task, and first with what an earlier run has done.
-        kept: gives the results of an earlier run that still hold, and gets those of each task as it ends.
+        progress: called with the numbers of images done and of all images: after each task, and at the start if an
+            earlier run has left results.
+        kept: supplies the valid results of an earlier run, and saves those of each task as it ends.
 
     Returns:
-        one result a recording, in the order of names, the same for any number of workers.
+        one result per recording, in the order of names, the same for any number of workers.
 
     Raises:
         InvalidRequest: the folder holds no recordings.
-        ConfigError: the scheduler is neither "local" nor a tcp address that answers, or its workers are gone.
+        ConfigError: the scheduler is neither "local" nor a tcp address that answers, or no worker is left.
     """
     recordings = recordings_in(folder)
     results = {} if kept is None else kept.of(recordings)
@@ -111,11 +113,11 @@ def batch_range(
 
 
 def _as_they_end(client: Any, futures: Sequence[Any]) -> Iterator[list[BatchResult]]:
-    """The results of each task as it ends.
+    """Yield the results of each task as it ends.
 
     Raises:
-        ConfigError: after the others have ended: a task killed worker after worker, or the workers cannot run it;
-            at once: no worker is left.
+        ConfigError: no worker is left, or a worker lacks a module (raised at once); a task was lost although it was
+            repeated (raised after the other tasks have ended).
     """
     distributed: Any = import_module("distributed")
     waiting, alone, lost = set(futures), 0, None
@@ -144,6 +146,7 @@ def _as_they_end(client: Any, futures: Sequence[Any]) -> Iterator[list[BatchResu
 
 @contextmanager
 def _client(scheduler: str, workers: int) -> Iterator[Any]:
+    """Yield a client of a local cluster, or of the scheduler at an address, with at least one worker."""
     distributed: Any = import_module("distributed")
     if scheduler == "local":
         with _local_cluster(distributed, workers) as cluster, distributed.Client(cluster) as client:
@@ -164,15 +167,16 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
 
 
 def _local_cluster(distributed: Any, workers: int) -> Any:
-    """Worker processes of this machine, deaf to Ctrl-C.
+    """Start worker processes on this machine that ignore Ctrl-C.
 
-    A terminal sends SIGINT to all of them, and each would answer with a traceback; they end with the cluster. Threads
-    and processes inherit the mask, so a worker that is replaced later is deaf as well.
+    A terminal sends SIGINT to all processes of a command, and each worker would print a traceback; workers end with the
+    cluster instead. Threads and processes inherit the signal mask, so a worker that is replaced later ignores SIGINT,
+    too.
     """
-    resource_tracker.ensure_running()  # its start would lift the mask
+    resource_tracker.ensure_running()  # if it started later, it would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        # One thread a worker: the compiled loops hold no lock, but Python between them does.
+        # One thread per worker: compiled loops release Python's global lock, but the code between them holds it.
         return distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

@@ -1,4 +1,4 @@
-"""What a batch gives, a JSON object a line: kept as it comes, so that a batch that is stopped can be gone on with."""
+"""Results of a batch as a file with one JSON object per line, saved as they come, so that a batch can be resumed."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hal.atomic_write import write_atomically
 from hal.errors import InvalidRequest
 from perception.range.recordings import Reading
 
-PART = ".part"
+PART = ".part"  # suffix of the file with the results of an unfinished batch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchResult:
-    """What one recording gave: `scene` as `render.scene_json`, or `error` and no scene."""
+    """Result of one recording: `scene` as `render.scene_json` returns it, or `error` and no scene."""
 
     name: str
     scene: dict[str, Any] | None
@@ -25,26 +25,26 @@ class BatchResult:
 
 
 class KeptResults:
-    """The results of a batch while it runs: lines added to OUT.part, which becomes OUT once all are there.
+    """Results of a running batch, appended to the file OUT.part, which becomes OUT when the batch is complete.
 
-    The first line says what was asked, every other holds a result and the state of its recording when the batch began;
-    so a second run takes over what still holds and nothing else.
+    The first line holds the request (folder and reading). Each other line holds one result, and size and time of its
+    recording at the start of the batch, so that a second run reuses only results of unchanged recordings.
 
     Attributes:
         part: path of OUT.part.
-        goes_on: an earlier run has left results there.
+        goes_on: whether an earlier run has left results there.
     """
 
     def __init__(self, out: Path, folder: Path, reading: Reading, *, afresh: bool = False) -> None:
-        """Open OUT.part, or begin it.
+        """Open OUT.part, or create it.
 
         Args:
             out: file for all results in the end.
-            folder, reading: what is asked of this batch.
-            afresh: forget what an earlier run left there.
+            folder, reading: request of this batch.
+            afresh: drop the results of an earlier run.
 
         Raises:
-            InvalidRequest: an earlier run left results of another folder or another reading.
+            InvalidRequest: an earlier run with another folder or reading has left results there.
         """
         self.part = out.with_name(out.name + PART)
         self._out = out
@@ -52,14 +52,14 @@ class KeptResults:
         earlier = {} if afresh else self._written()
         self._lines = {
             name: line for name, line in earlier.items() if line["error"] is None
-        }  # the others are tried again
+        }  # recordings that failed are tried again
         self.goes_on = bool(self._lines)
         self._stamps: dict[str, list[int]] = {}
         fresh = [json.dumps(self._asked), *(json.dumps(line) for line in self._lines.values())]
-        write_atomically(self.part, _lines(fresh))  # without the line that an abrupt end may have cut
+        write_atomically(self.part, _lines(fresh))  # drops a last line that was cut off when the earlier run was killed
 
     def of(self, recordings: Iterable[Path]) -> dict[str, BatchResult]:
-        """The earlier results that still hold, by name: those of unchanged recordings that gave a scene."""
+        """Return the earlier results that are still valid, by name: those of unchanged recordings that gave a scene."""
         self._stamps = {path.name: _stamp(path) for path in recordings}
         lines = [line for name, line in self._lines.items() if line["stamp"] == self._stamps.get(name)]
         found = (BatchResult(name=line["name"], scene=line["scene"], error=line["error"]) for line in lines)
@@ -67,21 +67,29 @@ class KeptResults:
 
     @property
     def done(self) -> int:
-        """Recordings of this batch with a result, taken over or new, by what is written: Ctrl-C parts it from any count."""
+        """Number of recordings of this batch with a result, reused or new.
+
+        It is counted in the file, because Ctrl-C may come between writing a result and counting it.
+        """
         return sum(line["stamp"] == self._stamps.get(name) for name, line in self._written().items())
 
     def add(self, results: Sequence[BatchResult]) -> None:
-        """Keep the results of a task."""
+        """Append the results of a task to OUT.part."""
         lines = [json.dumps({**asdict(result), "stamp": self._stamps[result.name]}) + "\n" for result in results]
         with self.part.open("a", encoding="utf-8") as file:
             file.write("".join(lines))
 
     def finish(self, results: Sequence[BatchResult]) -> None:
-        """Write all results to OUT, in the order given, and drop what was kept on the way."""
+        """Write all results to OUT, in the given order, and delete OUT.part."""
         write_results(self._out, results)
         self.part.unlink()
 
     def _written(self) -> dict[str, dict[str, Any]]:
+        """Return the complete result lines of OUT.part by name of the recording.
+
+        Raises:
+            InvalidRequest: they belong to another request.
+        """
         if not self.part.exists():
             return {}
         asked, *lines = [_object(text) for text in self.part.read_text(encoding="utf-8").splitlines()] or [None]
@@ -94,21 +102,23 @@ class KeptResults:
 
 
 def write_results(path: Path, results: Sequence[BatchResult]) -> None:
-    """One JSON object a line: name, scene or error. Whole or not at all."""
+    """Write one JSON object per line (name, scene or error); the file is written completely or not at all."""
     write_atomically(path, _lines(json.dumps(asdict(result)) for result in results))
 
 
 def _lines(lines: Iterable[str]) -> str:
+    """Join lines, with a newline after each."""
     return "\n".join(lines) + "\n"
 
 
 def _stamp(path: Path) -> list[int]:
+    """Return size and modification time of a file, by which a changed recording is recognised."""
     state = path.stat()
     return [state.st_size, state.st_mtime_ns]
 
 
 def _object(text: str) -> dict[str, Any] | None:
-    """The object of a line; None for a line that an abrupt end has cut."""
+    """Return the JSON object of a line; None if the line was cut off."""
     try:
         value = json.loads(text)
     except ValueError:

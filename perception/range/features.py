@@ -1,4 +1,4 @@
-"""Points, lines and planes with covariance, ready for fusion.
+"""Points, lines and planes with covariance, for fusion.
 
 A feature is a point with a (3, 3) covariance and, for lines and planes, a unit vector with a (3, 3) covariance whose
 null direction is the vector itself: the `C` and `M^-1` of the fusion measurements (paper, Section IV).
@@ -15,11 +15,11 @@ import numpy as np
 from hal.arrays import Array
 from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface
 
-LEAST_CREASE_RAD = 0.15  # planes closer to parallel meet in a line that noise decides
+LEAST_CREASE_RAD = 0.15  # planes at a smaller angle intersect in a line that is mostly determined by noise
 
 
 class FeatureKind(StrEnum):
-    """A feature's dimension: a point has none, a line has one, a plane has two."""
+    """Geometric type of a feature."""
 
     POINT = "point"
     LINE = "line"
@@ -31,11 +31,11 @@ class RangeFeature:
     """A measured feature in the sensor frame.
 
     Attributes:
-        point_m: (3,) the point; on the plane or line, the one nearest the middle of the data.
-        point_covariance: (3, 3) m^2. Singular along a line and in a plane: shifts there are not measured errors.
-        direction: (3,) unit line direction or plane normal (towards the sensor); zeros for a point.
+        point_m: (3,) the point; of a plane or line, its point nearest the middle of the data.
+        point_covariance: (3, 3) m^2; zero along a line and in a plane, where a shift of the point is no error.
+        direction: (3,) unit direction of a line or normal of a plane (towards the sensor); zeros for a point.
         direction_covariance: (3, 3) rad^2, null direction `direction`; zeros for a point.
-        labels: labels of the surfaces it came from.
+        labels: labels of the surfaces from which it was computed.
     """
 
     kind: FeatureKind
@@ -47,7 +47,7 @@ class RangeFeature:
 
     @property
     def sigma_point_m(self) -> float:
-        """Largest standard deviation of the point, metres; for a plane its offset along the normal."""
+        """Largest standard deviation of the point, metres; for a plane that of its offset along the normal."""
         return float(np.sqrt(np.linalg.eigvalsh(self.point_covariance)[-1]))
 
     @property
@@ -57,12 +57,12 @@ class RangeFeature:
 
 
 def plane_feature(surface: Surface) -> RangeFeature:
-    """The plane of a planar surface: offset covariance at its middle point, tilt covariance of its normal."""
+    """Return the plane of a planar surface, with the covariances of its offset (at its middle point) and normal."""
     plane = surface.primitive
     if not isinstance(plane, Plane):
         raise TypeError(f"surface {surface.label} is a {surface.type}, not a plane")
     n, frame, C = plane.normal, surface.frame, surface.covariance
-    # n . X = d: the offset of the plane at `point` is d(d) - point . d(n).
+    # The plane is n . X = d. Near `point` a change of n and d shifts it by delta d - point . delta n.
     row = np.array([-frame[0] @ plane.point_m, -frame[1] @ plane.point_m, 1.0])
     return RangeFeature(
         kind=FeatureKind.PLANE,
@@ -75,10 +75,11 @@ def plane_feature(surface: Surface) -> RangeFeature:
 
 
 def axis_feature(surface: Surface) -> RangeFeature:
-    """The axis of a cylinder or cone as a line."""
+    """Return the axis of a cylinder or cone as a line."""
     shape, frame, C = surface.primitive, surface.frame, surface.covariance
     if isinstance(shape, Cylinder):
-        # The fit shifts the axis at its own anchor; the anchor kept by `primitive_of` moves the tilt's lever to zero.
+        # The covariance of the shifts refers to the fit's own reference point; the lever of a tilt between that point and
+        # `point_m` is neglected.
         return RangeFeature(
             kind=FeatureKind.LINE,
             point_m=shape.point_m,
@@ -101,7 +102,7 @@ def axis_feature(surface: Surface) -> RangeFeature:
 
 
 def point_feature(surface: Surface) -> RangeFeature:
-    """The centre of a sphere or ellipsoid, or the apex of a cone."""
+    """Return the centre of a sphere or ellipsoid, or the apex of a cone."""
     shape, C = surface.primitive, surface.covariance
     if isinstance(shape, Sphere | Ellipsoid):
         point = shape.centre_m
@@ -120,7 +121,10 @@ def point_feature(surface: Surface) -> RangeFeature:
 
 
 def crease_line(a: Surface, b: Surface, near_m: Array | None = None) -> RangeFeature | None:
-    """The line where two planes meet, nearest `near_m` (3,) or the mean of their middles; None if near parallel."""
+    """Return the line in which two planes intersect, with covariance; None if they are nearly parallel.
+
+    Its point is the one nearest `near_m` (3,), or nearest the mean of the planes' middles.
+    """
     pa, pb = plane_feature(a), plane_feature(b)
     cross = np.cross(pa.direction, pb.direction)
     sine = float(np.linalg.norm(cross))
@@ -158,7 +162,7 @@ def crease_line(a: Surface, b: Surface, near_m: Array | None = None) -> RangeFea
 
 
 def corner_point(a: Surface, b: Surface, c: Surface) -> RangeFeature | None:
-    """The point where three planes meet, with covariance; None when they are too close to a common direction."""
+    """Return the point in which three planes intersect, with covariance; None if their normals are nearly coplanar."""
     planes = [plane_feature(s) for s in (a, b, c)]
     N = np.stack([p.direction for p in planes])
     if np.linalg.svd(N, compute_uv=False)[-1] < np.sin(LEAST_CREASE_RAD):
@@ -184,7 +188,7 @@ def corner_point(a: Surface, b: Surface, c: Surface) -> RangeFeature | None:
 
 
 def features_of(surfaces: Iterable[Surface]) -> tuple[RangeFeature, ...]:
-    """Each surface's own feature: planes as planes, cylinders and cones as axes, spheres and ellipsoids as points."""
+    """Return the feature of each surface: a plane, the axis of a cylinder or cone, or the centre of any other."""
     out = []
     for surface in surfaces:
         if isinstance(surface.primitive, Plane):
@@ -197,6 +201,7 @@ def features_of(surfaces: Iterable[Surface]) -> tuple[RangeFeature, ...]:
 
 
 def _jacobian(function, size: int, step: float) -> Array:  # type: ignore[no-untyped-def]  # numba types it
+    """Return the Jacobian of a function of `size` variables at zero, by central differences."""
     columns = []
     for k in range(size):
         d = np.zeros(size)

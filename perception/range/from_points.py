@@ -1,4 +1,4 @@
-"""Depth image from points, such as those of a scanner that the wrist sweeps."""
+"""Rendering of a depth image from points, such as those of a line scanner that the arm sweeps."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from hal.arrays import Array
 from hal.errors import NotFound
 from perception.range.sensor import RangeSensorModel
 
-SAME_SURFACE_M = 0.004  # points of one pixel within this of its nearest one are averaged: the nearest alone is biased
-FILL_NEIGHBOURS = 3  # an empty pixel between this many measured ones of one surface is filled by their mean
+SAME_SURFACE_M = 0.004  # points so near the nearest one in a pixel are averaged, because the nearest alone is biased
+FILL_NEIGHBOURS = 3  # an empty pixel with so many measured neighbours on one surface gets their mean
 FILL_PASSES = 2
 
 
 def image_from_points(points_base_m: Array, base_from_view: RigidTransform, sensor: RangeSensorModel) -> Array:
-    """(H, W) depth, m, of (N, 3) points seen from a virtual sensor at `base_from_view`; NaN where there is none.
+    """Return the depth image (H, W) in metres of points (N, 3), seen from a virtual sensor at `base_from_view`.
 
-    A pixel holds the mean of its points on the nearest surface, carried along the surface to the pixel's centre. Small
-    gaps are filled.
+    A pixel holds the mean of its points on the nearest surface, corrected to the pixel's centre by the slope of the
+    surface. Small gaps are filled; other pixels without points are NaN.
 
     Raises:
         NotFound: no point falls into the view.
@@ -34,7 +34,7 @@ def image_from_points(points_base_m: Array, base_from_view: RigidTransform, sens
     inside = np.all((pixel >= 0) & (pixel < shape), axis=1)
     if not inside.any():
         raise NotFound("none of the points falls into the view", hint="check the arm poses and the virtual sensor")
-    # Over a plane the inverse depth of a perspective image, and the depth of an orthographic one, is linear in the pixel.
+    # On a plane, inverse depth (perspective) or depth (orthographic) is linear over the image.
     value = 1.0 / P[inside, 2] if perspective else P[inside, 2]
     index = np.ravel_multi_index(tuple(pixel[inside].T), shape)
     centred = _at_centres(_means(index, P[inside, 2], value, place[inside] - pixel[inside], shape))
@@ -45,7 +45,10 @@ def image_from_points(points_base_m: Array, base_from_view: RigidTransform, sens
 
 
 def _means(index: NDArray[np.int64], depth_m: Array, value: Array, offset_px: Array, shape: tuple[int, int]) -> Array:
-    """(3, H, W): mean value and mean offset (rows, columns) from the pixel's centre of its points on the nearest surface."""
+    """Return per pixel the mean value of its points on the nearest surface and their mean offset, (3, H, W).
+
+    The offset (rows, columns) is from the pixel's centre. `index`: flat pixel index of each point.
+    """
     nearest = np.full(shape[0] * shape[1], np.inf)
     np.minimum.at(nearest, index, depth_m)
     chosen = depth_m <= nearest[index] + SAME_SURFACE_M
@@ -56,15 +59,15 @@ def _means(index: NDArray[np.int64], depth_m: Array, value: Array, offset_px: Ar
 
 
 def _at_centres(means: Array) -> Array:
-    """(H, W) values carried to the pixels' centres by the slope between their neighbours on both sides."""
+    """Return the values (H, W) at the pixels' centres, using the slope between the neighbours on both sides."""
     value, *offsets = means
     out = value.copy()
     for axis, offset in enumerate(offsets):
         before, after = (np.roll(np.stack([value, offset]), turn, axis=axis + 1) for turn in (1, -1))
-        # The neighbours' values stand at their own offsets, 2 px and the difference of these apart.
+        # The neighbours' values belong to their own mean positions, whose distance is 2 px plus the difference of offsets.
         slope = (after[0] - before[0]) / (2.0 + after[1] - before[1])
         is_smooth = np.abs(after[0] + before[0] - 2.0 * value) < np.abs(after[0] - before[0]) + 0.01 * np.abs(value)
-        is_smooth &= np.abs(slope) < 0.02 * np.abs(value)  # no jump: 1 cm a pixel at half a metre
+        is_smooth &= np.abs(slope) < 0.02 * np.abs(value)  # no jump: at most 1 cm per pixel at half a metre
         edge = [0, -1]
         is_smooth[(edge, slice(None)) if axis == 0 else (slice(None), edge)] = False
         out = out - np.where(is_smooth, slope * offset, 0.0)
@@ -72,7 +75,10 @@ def _at_centres(means: Array) -> Array:
 
 
 def _filled_once(depth: Array, tolerance_m: float) -> Array:
-    """The image with its empty pixels filled where enough neighbours lie on one surface."""
+    """Return the image with those empty pixels filled whose known neighbours are enough and lie on one surface.
+
+    `tolerance_m`: largest difference in depth between neighbours on one surface.
+    """
     padded = np.pad(depth, 1, constant_values=np.nan)
     h, w = depth.shape
     around = np.stack(

@@ -1,8 +1,9 @@
 """Estimation of the noise model of a range image from the image itself.
 
-Three causes are told apart, because a method tuned to one fails on the others: white noise, seen in small windows;
-correlated noise, which only larger windows see; and the step between codes, which hides noise smaller than itself.
-Each grows with depth as `a + b z^2`, the law of triangulating sensors; laser scanners have b near 0.
+Three kinds of noise are distinguished, because a method tuned to one fails on the others: white noise, which is visible
+in small windows; correlated (slow) noise, which only larger windows show; and the step between depth codes, which hides
+noise smaller than itself. Each grows with depth z as `a + b z^2`, the law of triangulating sensors; for laser scanners
+b is near 0.
 """
 
 from __future__ import annotations
@@ -17,49 +18,53 @@ from hal.arrays import Array
 from hal.jit import compiled
 from perception.range.sensor import RangeSensorModel
 
-WINDOW = 5  # samples across; a window of 25 samples rarely holds a gross error
-LARGE_SHARE = 1 / 60  # of the shorter side: spacing of the large window's samples, at least 2 pixels
-QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above it in all but the busiest scenes
+WINDOW = 5  # samples along a window; a window of 25 samples rarely holds a gross error
+LARGE_SHARE = 1 / 60  # spacing of the large window's samples, as a ratio of the shorter side; at least 2 pixels
+QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above this quantile in all but the busiest scenes
 WORST_SHARE = 0.03  # of the depth: an image that scatters more shows no surface, and no model may explain it as one
-NORMAL_QUANTILE = -0.6745
-DEPTH_BINS = 6
-TYPICAL_SAMPLES = 2048
-CODE_SAMPLES = 1024
-STEPPED_SHARE = 0.25  # fewer distinct values than this share of the pixels: the depth comes in codes
-FLOOR_RATIO = 0.15  # of the pixel pitch: real surfaces are no truer than this, and noise-free images keep weights
+NORMAL_QUANTILE = -0.6745  # of the standard normal distribution, at QUANTILE
+DEPTH_BINS = 6  # ranges of depth, each of which gives one point of the law
+TYPICAL_SAMPLES = 2048  # depths from which `typical_depths_m` is estimated
+CODE_SAMPLES = 1024  # depths by which continuous depth is recognised
+STEPPED_SHARE = 0.25  # depth is coded if the number of distinct values is below this share of the number of pixels
+FLOOR_RATIO = 0.15  # least sigma per pixel pitch: real surfaces are no smoother, and noise-free images need weights too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseModel:
-    """Standard deviation of depth as a function of depth z in metres, each part `(a, b)` as `a + b z^2` (m, 1/m)."""
+    """Standard deviation of depth as a function of depth z in metres.
+
+    Each part is a pair `(a, b)` of the law `a + b z^2` (m, 1/m): white noise, noise that neighbouring pixels share, and the
+    step between neighbouring depth codes.
+    """
 
     white: tuple[float, float]
     correlated: tuple[float, float]
     step: tuple[float, float]
 
     def sigma_m(self, depth_m: Array | float) -> Array:
-        """Total standard deviation of one pixel at `depth_m`: white, correlated and coding, metres."""
+        """Return the total standard deviation of one pixel at `depth_m` in metres: white, correlated and coding noise."""
         z2 = np.asarray(depth_m, float) ** 2
         white, slow, step = (a + b * z2 for a, b in (self.white, self.correlated, self.step))
         return np.asarray(np.sqrt(np.maximum(white**2, step**2 / 12.0) + slow**2))
 
     def sigma_of(self, depth_m: float) -> float:
-        """`sigma_m` of one depth, without arrays."""
+        """Return `sigma_m` of a single depth, without the cost of arrays."""
         z2 = depth_m * depth_m
         white, slow, step = (a + b * z2 for a, b in (self.white, self.correlated, self.step))
         return sqrt(max(white**2, step**2 / 12.0) + slow**2)
 
     def slow_share(self, depth_m: float) -> float:
-        """Part of the variance at `depth_m` that neighbouring pixels share, 0 to 1."""
+        """Return the share of the variance at `depth_m` that neighbouring pixels have in common, 0 to 1."""
         slow = self.correlated[0] + self.correlated[1] * depth_m**2
         return float(slow**2 / max(self.sigma_of(depth_m) ** 2, 1e-30))
 
     def packed(self) -> Array:
-        """(6,) white, correlated and step pairs: what the compiled loops read."""
+        """Return the white, correlated and step pairs as an array (6,), the form that compiled loops read."""
         return np.array([*self.white, *self.correlated, *self.step])
 
     def scaled(self, factor: float) -> NoiseModel:
-        """The model with every part times `factor`."""
+        """Return this model with every part multiplied by `factor`."""
         if factor == 1.0:
             return self
         parts = ((factor * a, factor * b) for a, b in (self.white, self.correlated, self.step))
@@ -67,7 +72,7 @@ class NoiseModel:
         return NoiseModel(white=white, correlated=correlated, step=step)
 
     def widened(self, factor: float, depths_m: Array) -> NoiseModel:
-        """The model with `factor` times the total sigma at the given depths (N,); the excess counts as correlated."""
+        """Return a model with `factor` times the total sigma at the given depths (N,); the excess counts as correlated."""
         z2 = depths_m**2
         total = factor * self.sigma_m(depths_m)
         white = self.white[0] + self.white[1] * z2
@@ -75,15 +80,18 @@ class NoiseModel:
 
     @property
     def is_stepped(self) -> bool:
-        """Whether the step between codes is coarser than the noise that it should resolve, at one metre."""
+        """Whether the step between codes at one metre is coarser than the noise that it should resolve."""
         return self.step[0] + self.step[1] > 2.0 * (self.white[0] + self.white[1])
 
 
 def estimate_noise(depth_m: Array, sensor: RangeSensorModel, *, depths_m: Array | None = None) -> NoiseModel:
-    """The noise model of an (H, W) depth image in metres with NaN holes; `depths_m`: its typical depths, where known.
+    """Estimate the noise model of an (H, W) depth image in metres, NaN where there is no reading.
 
-    Smooth surfaces are locally quadratic in 1/z (pinhole) or z (orthographic), so what a quadratic leaves over in a
-    window is noise. A low quantile over the windows ignores those that hold an edge.
+    Smooth surfaces are locally quadratic in 1/z (pinhole) or z (orthographic), so the residual of a quadratic fitted to a
+    window is noise. A low quantile over the windows ignores those that contain an edge.
+
+    Args:
+        depths_m: (5,) `typical_depths_m` of the image, if they are already known.
     """
     packed = sensor.packed()
     perspective = packed[0] > 0
@@ -95,7 +103,7 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel, *, depths_m: Array 
     large = _window_law(g, perspective, spacing_px=spacing, stride_px=2 * spacing)
     step = coding_step(depth_m)
     white = _fit_law(z2, np.maximum(small[0] + small[1] * z2, floor))
-    # The slow part is what the large windows see beyond the small ones and beyond the code step itself.
+    # The slow part is the noise in the large windows in excess of that in the small ones and of the code step.
     seen = np.maximum(white[0] + white[1] * z2, (step[0] + step[1] * z2) / np.sqrt(12.0))
     slow = np.sqrt(np.maximum((large[0] + large[1] * z2) ** 2 - 1.4 * seen**2, 0.0))
     law = NoiseModel(white=white, correlated=_fit_law(z2, slow), step=step)
@@ -104,7 +112,7 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel, *, depths_m: Array 
 
 
 def coding_step(depth_m: Array) -> tuple[float, float]:
-    """`(a, b)` of the step between neighbouring depth codes `a + b z^2`; (0, 0) for continuous depth."""
+    """Return `(a, b)` of the step `a + b z^2` between neighbouring depth codes; (0, 0) for continuous depth."""
     # A sample decides quickly whether the depth is continuous; only coded depth is worth a full sort.
     sample = valid_sample(depth_m, CODE_SAMPLES)
     if sample.size < 16 or np.unique(sample).size > 0.7 * sample.size:
@@ -122,7 +130,7 @@ def coding_step(depth_m: Array) -> tuple[float, float]:
 
 
 def typical_depths_m(depth_m: Array) -> Array:
-    """(5,) quantiles of the valid depths, metres: where a noise law is judged."""
+    """Return five quantiles (5,) of the valid depths in metres, at which noise models are evaluated; ones without any."""
     sample = np.sort(valid_sample(depth_m, TYPICAL_SAMPLES))
     if sample.size == 0:
         return np.ones(5)
@@ -131,7 +139,7 @@ def typical_depths_m(depth_m: Array) -> Array:
 
 @compiled
 def valid_sample(depth: Array, most: int) -> Array:
-    """Every n-th of the valid depths in raster order, n so that about `most` remain."""
+    """Return every n-th of the valid depths in raster order, with n such that about `most` remain."""
     flat = depth.ravel()
     valid = 0
     for i in range(flat.shape[0]):
@@ -150,6 +158,10 @@ def valid_sample(depth: Array, most: int) -> Array:
 
 
 def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int) -> tuple[float, float]:
+    """Return the noise law `(a, b)` of the residuals in windows of `WINDOW` samples across, `spacing_px` apart.
+
+    `g` (H, W) is 1 / depth (`perspective`) or depth; (0, 0) if the image is too small for a window.
+    """
     if min(g.shape) <= (WINDOW - 1) * spacing_px:
         return 0.0, 0.0
     freedom = WINDOW * WINDOW - BASIS.shape[0]
@@ -169,18 +181,23 @@ def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int)
 
 
 def _low_quantile(values: Array) -> float:
+    """Return the quantile `QUANTILE` of the values (N,)."""
     k = int(QUANTILE * values.size)
     return float(np.partition(values, k)[k])
 
 
 def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
-    """Non-negative `a + b z^2` through the values, relative errors weighed, robust to a bin without a clean window."""
+    """Fit the law `a + b z^2` with a, b >= 0 to values at squared depths `z2`; returns `(a, b)`."""
     a, b = _law_through(z2, values)
     return float(a), float(b)
 
 
 @compiled
 def _law_through(z2: Array, values: Array) -> tuple[float, float]:
+    """Compute `_fit_law`, robust to depths at which no window is free of edges.
+
+    Residuals are weighted by the inverse of the values, because relative errors count.
+    """
     typical = float(np.median(values))
     if typical <= 0.0:
         return float(np.mean(values)), 0.0
@@ -189,14 +206,14 @@ def _law_through(z2: Array, values: Array) -> tuple[float, float]:
     for _ in range(3):
         a, b = _two_non_negative(w, w * z2, w * values)
         for i in range(w.shape[0]):
-            # A bin far above the law is busy, not noisy.
+            # A bin far above the law contains edges rather than noise.
             w[i] *= 0.25 if values[i] > 1.5 * (a + b * z2[i]) else 1.0
     return a, b
 
 
 @compiled
 def _two_non_negative(p: Array, q: Array, y: Array) -> tuple[float, float]:
-    """Least squares `y = a p + b q` with a, b >= 0: the free solution, or the better of the two edges."""
+    """Solve y = a p + b q for a, b >= 0 by least squares; where the free solution is negative, a or b is 0."""
     pp, qq, pq, py, qy = np.sum(p * p), np.sum(q * q), np.sum(p * q), np.sum(p * y), np.sum(q * y)
     det = pp * qq - pq * pq
     if det > 1e-9 * pp * qq:
@@ -210,7 +227,7 @@ def _two_non_negative(p: Array, q: Array, y: Array) -> tuple[float, float]:
 
 
 def quadratics(side: int) -> Array:
-    """(6, side^2) orthonormal polynomials up to degree 2 on a square window."""
+    """Return the orthonormal polynomials (6, side^2) up to degree 2 on a square window, those of low degree first."""
     t = np.arange(side) - (side - 1) / 2
     v, u = np.meshgrid(t, t, indexing="ij")
     columns = [np.ones_like(u), u, v, u * u, u * v, v * v]
@@ -225,9 +242,15 @@ BASIS = quadratics(WINDOW)
 def window_rms(
     g: Array, basis: Array, first: int, spacing: int, stride: int, perspective: bool,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Depth at the middle of each complete window, and the rms in metres that the first polynomials leave, and that all do.
+    """Return depth and residuals of each window without missing samples, three arrays (N,) in metres.
 
-    `basis` as `quadratics`, `first` of them; equal where `first` is all.
+    These are the depth at the middle of the window, the rms residual after a fit of the first `first` polynomials of
+    `basis` (see `quadratics`), and the rms residual after a fit of all of them.
+
+    Args:
+        g: (H, W) 1 / depth (`perspective`) or depth.
+        spacing: distance of neighbouring samples of a window in pixels.
+        stride: distance of neighbouring windows in pixels.
     """
     H, W = g.shape
     side = int(np.sqrt(basis.shape[1]) + 0.5)
@@ -258,9 +281,10 @@ def _squares_left(
     g: Array, middle: Array, basis: Array, first: int, spacing: int, stride: int, values: Array, dot: Array,
     some: Array, total: Array,
 ) -> None:  # fmt: skip
-    """Of the windows that begin in the first row of `g` what the first polynomials leave in `some`, and all in `total`.
+    """Compute the residual sums of squares of all windows that begin in the first row of `g`.
 
-    All windows of a row at once: loops over them hold no branch.
+    Writes those after a fit of the first polynomials into `some`, and after a fit of all into `total`. The windows of a
+    row are processed together, so that the loops have no branch.
     """
     side = int(np.sqrt(basis.shape[1]) + 0.5)
     total[:] = 0.0
@@ -278,6 +302,7 @@ def _squares_left(
 
 @compiled
 def _load_sample(samples: Array, middle: Array, values: Array, total: Array) -> None:
+    """Write one sample of each window, relative to its middle, into `values`, and add its square to `total`."""
     for c in range(values.shape[0]):
         value = samples[c] - middle[c]
         values[c] = value
@@ -286,11 +311,13 @@ def _load_sample(samples: Array, middle: Array, values: Array, total: Array) -> 
 
 @compiled
 def _add_multiple(factor: float, values: Array, out: Array) -> None:
+    """Add `factor` times `values` to `out`."""
     for c in range(out.shape[0]):
         out[c] += factor * values[c]
 
 
 @compiled
 def _subtract_square(values: Array, out: Array) -> None:
+    """Subtract the squares of `values` from `out`."""
     for c in range(out.shape[0]):
         out[c] -= values[c] * values[c]

@@ -19,17 +19,22 @@ from perception.range.segmentation.grid import Grid, block_size, build_grid
 from perception.range.segmentation.regions import regions_of
 from perception.range.sensor import RangeSensorModel
 
-HYPOTHESES = 24
+HYPOTHESES = 24  # seeds whose planes are tried, per direction of the normal
 INLIER_SIGMAS = 3.0
-LEAST_BLOCKS = 12
-LEAST_SHARE = 0.05  # of the valid blocks: a plane that holds less is not the panel
+LEAST_BLOCKS = 12  # least number of blocks near the expected plane, and on the plane found
+LEAST_SHARE = 0.05  # of the valid pixels: a plane with fewer is not the panel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlaneFit:
-    """The plane found, as a surface and as a fusion feature, and the share of the image that lies on it.
+    """The plane found, as a surface and as a fusion feature.
 
-    `sight_share` is the share of all valid pixels on the plane; `inliers` (H, W) says which.
+    Attributes:
+        surface: the plane with its covariance, in the sensor frame.
+        feature: the same plane for fusion.
+        inliers: (H, W) pixels that lie on the plane.
+        sight_share: their share of all valid pixels.
+        noise: the noise model used.
     """
 
     surface: Surface
@@ -49,15 +54,15 @@ def fit_plane_near(
     sigma_angle_rad: float = 0.1,
     noise: NoiseModel | None = None,
 ) -> PlaneFit:
-    """The largest plane within three standard deviations of an expected one, fitted on depth residuals.
+    """Fit the largest plane that agrees with an expected one within three standard deviations.
 
     The expectation only selects inliers and is no prior of the fit, so the result may be fused with its source.
 
     Args:
         depth_m: (H, W) depth in metres, NaN where missing.
-        point_m, normal: (3,) expected plane in the sensor frame; either sense of the normal.
-        sigma_offset_m, sigma_angle_rad: how well the expectation is known.
-        noise: used instead of the estimate from the image when given.
+        point_m, normal: (3,) expected plane in the sensor frame; the normal may point either way.
+        sigma_offset_m, sigma_angle_rad: standard deviations of the expectation.
+        noise: noise model to use instead of an estimate from the image.
 
     Raises:
         InvalidRequest: the image, sensor or expectation is not usable.
@@ -90,6 +95,11 @@ def fit_plane_near(
 def _checked_expectation(
     point_m: ArrayLike, normal: ArrayLike, sigma_offset_m: float, sigma_angle_rad: float
 ) -> tuple[Array, Array]:
+    """Return the expected unit normal, towards the sensor, and the point.
+
+    Raises:
+        InvalidRequest: they are not usable.
+    """
     n, p = np.asarray(normal, float), np.asarray(point_m, float)
     length = float(np.linalg.norm(n)) if n.shape == (3,) else 0.0
     if n.shape != (3,) or p.shape != (3,) or not np.isfinite([*n, *p]).all() or length < 1e-9:
@@ -101,6 +111,7 @@ def _checked_expectation(
 
 
 def _block_points(grid: Grid) -> tuple[Array, Array, Array]:
+    """Return points (N, 3), standard deviations (N,) and normals (N, 3) of the blocks that have a tangent plane."""
     x, y, z = grid.x.ravel(), grid.y.ravel(), grid.z.ravel()
     points = np.stack([x * z, y * z, z] if grid.perspective else [x, y, z], axis=1)
     ok = np.isfinite(z) & np.isfinite(grid.rms.ravel())
@@ -110,6 +121,7 @@ def _block_points(grid: Grid) -> tuple[Array, Array, Array]:
 def _near_expectation(
     points: Array, sigma: Array, expected: Array, through: Array, *, sigma_offset_m: float, sigma_angle_rad: float
 ) -> NDArray[np.bool_]:
+    """Return which points (N, 3) the expected plane may contain, within three standard deviations."""
     away = (points - through) @ expected
     lateral = np.linalg.norm(points - through - away[:, None] * expected, axis=1)
     gate = 3.0 * np.sqrt(sigma_offset_m**2 + (lateral * np.tan(min(sigma_angle_rad, 1.0))) ** 2 + sigma**2)
@@ -119,13 +131,13 @@ def _near_expectation(
 def _most_supported(
     points: Array, sigma: Array, normals: Array, expected: Array, *, sigma_angle_rad: float, normal_sigma_rad: float
 ) -> Array | None:
-    """Return normal and offset (4,) of the plane hypothesis with the most inlier blocks, refitted; None without one."""
+    """Return normal and offset (4,) of the plane hypothesis with the most inlier blocks, refitted; None if all fail."""
     turn = np.arccos(np.clip(normals @ expected, -1.0, 1.0))
     facing = np.flatnonzero(turn <= 3.0 * np.hypot(sigma_angle_rad, normal_sigma_rad) + 0.05)
     if facing.size < LEAST_BLOCKS:
         return None
     seeds = facing[np.linspace(0, facing.size - 1, min(HYPOTHESES, facing.size)).astype(int)]
-    # A seed's own normal is too noisy to reach across the panel, so it only supplies the offset at first.
+    # The normal of a single block is too noisy to be extrapolated across the panel, so a seed only gives the offset.
     plane, support = None, LEAST_BLOCKS - 1
     for n in (expected, *(_mean_normal(normals[facing], expected),)):
         for seed in seeds:
@@ -140,13 +152,17 @@ def _most_supported(
 
 
 def _mean_normal(normals: Array, expected: Array) -> Array:
+    """Return the direction of the median of the normals (N, 3), or the expected one if they scatter too much."""
     middle = np.median(normals, axis=0)
     length = float(np.linalg.norm(middle))
     return np.asarray(middle / length) if length > 0.5 else expected
 
 
 def _refitted(points: Array, sigma: Array, plane: Array, sigma_angle_rad: float) -> tuple[Array, int]:
-    """Refit a plane by weighted principal axes to its inliers, with a gate that narrows; returns it and their number."""
+    """Refit a plane to its inliers by weighted principal axes, with a shrinking tolerance.
+
+    Returns the plane (4,) and the number of its inliers.
+    """
     thin = max(1, len(points) // 1500)
     P, s = points[::thin], sigma[::thin]
     inside = np.zeros(len(P), bool)
@@ -165,6 +181,11 @@ def _refitted(points: Array, sigma: Array, plane: Array, sigma_angle_rad: float)
 
 
 def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Array) -> PlaneFit:
+    """Fit a plane (4,) to all pixels near it, and collect the result.
+
+    Raises:
+        NotFound: fewer than `LEAST_SHARE` of the valid pixels lie on it.
+    """
     th = np.zeros(SIZE)
     th[:4] = plane
     points = sensor.points(depth)
@@ -185,6 +206,7 @@ def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Ar
 
 
 def _nothing_near(sigma_offset_m: float, sigma_angle_rad: float) -> NotFound:
+    """Return the error for an image without a plane near the expected one."""
     return NotFound(
         "no plane lies near the expected one",
         hint=f"widen the expectation ({sigma_offset_m:.3f} m, {sigma_angle_rad:.2f} rad) or rescan from elsewhere",

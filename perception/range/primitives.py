@@ -1,4 +1,4 @@
-"""Named surfaces with their parameters and covariance, in the sensor frame, metres and radians."""
+"""Types of surfaces with parameters and covariance, in the sensor frame, metres and radians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SI
 
 
 class SurfaceType(StrEnum):
-    """What a surface is."""
+    """Geometric type of a surface."""
 
     PLANE = "plane"
     SPHERE = "sphere"
@@ -34,7 +34,10 @@ TYPE_OF_KIND = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plane:
-    """All X with `normal . (X - point_m) = 0`; `normal` (3,) points to the sensor, `point_m` (3,) is the middle."""
+    """Plane of all X with `normal . (X - point_m) = 0`.
+
+    `normal` (3,) is a unit vector towards the sensor; `point_m` (3,) is the point nearest the middle of the region.
+    """
 
     point_m: Array
     normal: Array
@@ -42,7 +45,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sphere:
-    """Centre (3,) and radius; `seen_from_inside` tells a bowl from a ball."""
+    """Sphere with centre (3,) and radius; `seen_from_inside` is true for a bowl and false for a ball."""
 
     centre_m: Array
     radius_m: float
@@ -51,7 +54,7 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Cylinder:
-    """Point of the axis nearest the middle of the region (3,), unit axis (3,), radius."""
+    """Cylinder with the point (3,) of its axis nearest the middle of the region, unit axis (3,) and radius."""
 
     point_m: Array
     axis: Array
@@ -61,7 +64,7 @@ class Cylinder:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Cone:
-    """Apex (3,), unit axis from the apex into the cone (3,), angle between axis and wall."""
+    """Cone with apex (3,), unit axis (3,) from the apex into the cone, and the angle between axis and surface."""
 
     apex_m: Array
     axis: Array
@@ -71,7 +74,7 @@ class Cone:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ellipsoid:
-    """Centre (3,), radii (3,) longest first, and their directions as the columns of `axes` (3, 3)."""
+    """Ellipsoid with centre (3,), radii (3,), longest first, and their directions as the columns of `axes` (3, 3)."""
 
     centre_m: Array
     radii_m: Array
@@ -86,16 +89,16 @@ class Surface:
     """One region of the image and the primitive that explains it.
 
     Attributes:
-        label: its value in `RangeScene.labels`.
+        label: value of its pixels in `RangeScene.labels`.
         primitive: parameters in the sensor frame.
         covariance: (p, p) over `covariance_over`; shifts in metres, tilts and angles in radians.
         covariance_over: names of the p tangent parameters. `tilt_1` and `tilt_2` turn the unit vector towards the
             first and second vector of `frame`; `across_1`, `across_2` shift the axis along them.
         frame: (2, 3) those two vectors.
-        pixels: pixels with this label.
+        pixels: number of pixels with this label.
         rms_m: root mean square residual in depth of the pixels that the fit kept.
-        misfit: the same in standard deviations of the noise model; near 1 when model and noise are right.
-        middle_m: (3,) median-depth point of the region.
+        misfit: the same in standard deviations of the noise model; near 1 if surface and noise model are right.
+        middle_m: (3,) middle of the region: the point at the medians of ray coordinates and depth.
     """
 
     label: int
@@ -120,7 +123,10 @@ COVARIANCE_OVER = {
 
 
 def primitive_of(kind: int, th: Array, middle_m: Array) -> Primitive:
-    """The named primitive of a parameter vector (see `surfaces`); `middle_m` (3,) anchors planes and axes."""
+    """Build the primitive of a parameter vector (see `fitting.surfaces`).
+
+    The reference point of a plane or of a cylinder's axis is the point nearest `middle_m` (3,).
+    """
     if kind == PLANE:
         normal = th[:3].copy()
         return Plane(point_m=_along(middle_m, float(th[3]) - _dot(normal, middle_m), normal), normal=normal)
@@ -138,19 +144,19 @@ def primitive_of(kind: int, th: Array, middle_m: Array) -> Primitive:
 
 
 def _dot(a: Array, b: Array) -> float:
-    """Product of two vectors (3,): at this size plain numbers are faster than arrays."""
+    """Return the dot product of two vectors (3,); at this size plain numbers are faster than arrays."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return float(ax * bx + ay * by + az * bz)
 
 
 def _along(point: Array, distance: float, direction: Array) -> Array:
-    """(3,) the point that far away in a direction."""
+    """Return the point (3,) at the given distance from another point in a direction."""
     (x, y, z), (dx, dy, dz) = point.tolist(), direction.tolist()
     return np.array([x + distance * dx, y + distance * dy, z + distance * dz])
 
 
 def ellipsoid_of(th: Array) -> Ellipsoid:
-    """Centre, radii and axes of a QUADRIC parameter vector that is an ellipsoid.
+    """Return centre, radii and axes of a QUADRIC parameter vector that is an ellipsoid.
 
     With X = centre + s Y and Y' A Y + 2 b' Y + c = 0: Y0 = -A^-1 b, radii_i = s sqrt((b' A^-1 b - c) / lambda_i).
     """
@@ -166,17 +172,17 @@ def ellipsoid_of(th: Array) -> Ellipsoid:
 
 
 def frame_vectors(kind: int, th: Array) -> Array:
-    """(2, 3) tangent vectors that `tilt_1`, `tilt_2`, `across_1` and `across_2` refer to."""
+    """Return the tangent vectors (2, 3) to which `tilt_1`, `tilt_2`, `across_1` and `across_2` refer."""
     frame = np.zeros(6)
     frame_of(kind, th, frame)
     return frame.reshape(2, 3)
 
 
 def named_covariance(kind: int, th: Array, covariance: Array) -> Array:
-    """Covariance over `COVARIANCE_OVER[kind]` from the one over the tangent parameters of `surfaces`."""
+    """Convert a covariance over the tangent parameters of `fitting.surfaces` to one over `COVARIANCE_OVER[kind]`."""
     if kind != QUADRIC:
         return covariance
-    # Ellipsoids are fitted as coefficients; centre and radii follow by finite differences.
+    # An ellipsoid is fitted by its coefficients; finite differences give the Jacobian of centre and radii.
     step = np.sqrt(np.maximum(np.diag(covariance), 1e-20)) * 0.1
     J = _shape_jacobian(th, step)
     return np.asarray(J @ covariance @ J.T)
@@ -184,7 +190,10 @@ def named_covariance(kind: int, th: Array, covariance: Array) -> Array:
 
 @compiled
 def _shape_jacobian(th: Array, step: Array) -> Array:
-    """(6, 9) central differences of centre and radii over the tangent parameters of a QUADRIC, `step` (9,) each way."""
+    """Return the Jacobian (6, 9) of centre and radii over a QUADRIC's tangent parameters, by central differences.
+
+    `step` (9,): change of each parameter in either direction.
+    """
     J, delta, frame = np.empty((6, 9)), np.zeros(9), np.zeros(6)
     before, after = np.empty(SIZE), np.empty(SIZE)
     for k in range(9):
@@ -199,7 +208,7 @@ def _shape_jacobian(th: Array, step: Array) -> Array:
 
 @compiled
 def centre_and_radii(th: Array) -> Array:
-    """(6,) centre and radii of a QUADRIC, as `ellipsoid_of`."""
+    """Return centre and radii (6,) of a QUADRIC as `ellipsoid_of` does, in compiled code."""
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
     )

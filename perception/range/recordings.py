@@ -1,11 +1,13 @@
-"""Range recordings on disk: npz, npy, PNG and TIFF, decoded to metres with their sensor.
+"""Range recordings in files (npz, npy, PNG and TIFF), decoded to metres, with their sensor.
 
-npz: `depth` (float or integer) and JSON text `meta` with `unit` ("m" or "mm"), `sensor` ({"kind": "pinhole", "shape",
-"f", "fy", "cx", "cy"} or {"kind": "ortho", "shape", "pitch"}; pitch in the unit), or `K` = fx, fy, cx, cy or
-the 3x3 matrix, with depth in millimetres. A reading of a cell's scanner (`panelwright devices read --save`) has `depth_m`
-for `depth`. Where both are absent, 8-bit codes `u8` are decoded with `meta.u8` (`near`,
-`far`, 0 near .. 255 far).
-npy, PNG, TIFF, and npz with `depth` alone: the bare image; what it does not say comes from a `Reading`.
+An npz file has:
+    depth    (H, W), floats or integer codes; `depth_m` in a reading saved by `panelwright devices read --save`.
+    meta     JSON text with `unit` ("m" or "mm") and `sensor`: {"kind": "pinhole", "shape", "f", "fy", "cx", "cy"} or
+             {"kind": "ortho", "shape", "pitch"}, with the pitch in the unit.
+    K        instead of `meta`: fx, fy, cx, cy or the 3x3 matrix; depth is then in millimetres.
+    u8       8-bit codes, used if there is no depth; decoded with `near` and `far` in `meta.u8` (codes 0 to 255).
+
+An npy, PNG or TIFF file, and an npz file with `depth` alone, has only the image; a `Reading` supplies the rest.
 """
 
 from __future__ import annotations
@@ -28,9 +30,9 @@ from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSens
 from perception.range.window import Window, decode_scaled
 
 SUFFIXES = (".npz", ".npy", ".png", ".tif", ".tiff")
-UNITS_M = {"m": 1.0, "mm": 0.001}
-DEFAULT_CODE_M = 0.001  # what a code of a 16-bit depth image usually stands for
-DEFAULT_FOCAL_PER_WIDTH = 0.9  # structured-light cameras see about 58 degrees across
+UNITS_M = {"m": 1.0, "mm": 0.001}  # metres per unit
+DEFAULT_CODE_M = 0.001  # metres per code, as is usual in 16-bit depth images
+DEFAULT_FOCAL_PER_WIDTH = 0.9  # focal length per image width; structured-light cameras see about 58 degrees across
 UNREADABLE = (
     OSError,
     ValueError,
@@ -49,12 +51,12 @@ class Reading:
     """How to read a recording: what its file does not say, or says wrongly.
 
     Attributes:
-        scale_m: metres a unit of floats or a code of integers; instead of what the file says.
-        near_m, far_m: window of 8-bit codes, 0 near to 255 far; given together.
+        scale_m: metres per unit of floats or per code of integers, instead of what the file says.
+        near_m, far_m: depths of the 8-bit codes 0 and 255; both or neither are given.
         focal_px: fx and fy of a pinhole sensor.
         centre_px: its cx and cy; the middle of the image by default.
         pitch_m: pixel pitch of an orthographic sensor; excludes `focal_px`.
-        codes: read the 8-bit codes of an npz even where it has depth.
+        codes: whether to read the 8-bit codes of an npz file even if it has depth.
 
     Raises:
         InvalidRequest: values that contradict each other or make no sense.
@@ -82,13 +84,13 @@ class Reading:
 
     @property
     def window(self) -> Window | None:
-        """The window of 8-bit codes, if it is given."""
+        """The window of 8-bit codes; None if it is not given."""
         if self.near_m is None or self.far_m is None:
             return None
         return Window(near_m=self.near_m, far_m=self.far_m)
 
     def sensor(self, shape: tuple[int, int]) -> RangeSensorModel | None:
-        """The sensor model that is given, for an image of `shape` (H, W); None when none is."""
+        """Return the given sensor model for an image of `shape` (H, W); None if none is given."""
         h, w = shape
         if self.pitch_m is not None:
             return OrthographicSensor(width_px=w, height_px=h, pixel_pitch_m=self.pitch_m)
@@ -104,11 +106,11 @@ AS_FILED = Reading()
 def load_recording(
     path: Path, *, reading: Reading = AS_FILED, sensor: RangeSensorModel | None = None, codes: bool = False
 ) -> tuple[Array, RangeSensorModel]:
-    """Depth (H, W) in metres with NaN, and the sensor model, of one recording.
+    """Return depth (H, W) in metres, with NaN for missing readings, and the sensor model of one recording.
 
     Args:
         reading: what the file does not say.
-        sensor: used instead of what file and `reading` say.
+        sensor: sensor model to use instead of that of the file or of `reading`.
         codes: as `Reading.codes`.
 
     Raises:
@@ -129,7 +131,7 @@ def load_recording(
 
 
 def assumptions(path: Path, reading: Reading) -> tuple[str, ...]:
-    """What is taken for granted when `path` is loaded with `reading`: plain sentences."""
+    """Return a sentence for each assumption that is made if `path` is loaded with `reading`."""
     out = []
     if _is_bare(path) and reading.sensor((1, 1)) is None:
         out.append("no sensor is given: a pinhole of 58 degrees across is assumed, so sizes may be off by its error")
@@ -139,7 +141,7 @@ def assumptions(path: Path, reading: Reading) -> tuple[str, ...]:
 
 
 def _is_bare(path: Path) -> bool:
-    """Does the file hold an image and nothing about its sensor?"""
+    """Return whether the file holds an image and nothing about its sensor."""
     if path.suffix.lower() != ".npz":
         return True
     with np.load(path, allow_pickle=False) as data:
@@ -147,7 +149,7 @@ def _is_bare(path: Path) -> bool:
 
 
 def assumed_sensor(shape: tuple[int, int]) -> PinholeSensor:
-    """A pinhole of 58 degrees across for an image of `shape` (H, W) whose sensor nobody names."""
+    """Return a pinhole that sees 58 degrees across, for an image of `shape` (H, W) with an unknown sensor."""
     h, w = shape
     focal = DEFAULT_FOCAL_PER_WIDTH * w
     return PinholeSensor(width_px=w, height_px=h, fx_px=focal, fy_px=focal, cx_px=(w - 1) / 2, cy_px=(h - 1) / 2)
@@ -157,6 +159,11 @@ Loaded = tuple[Array, RangeSensorModel | None]
 
 
 def _loader(path: Path) -> Callable[[Path, Reading, bool], Loaded]:
+    """Return the function that loads a file with the suffix of `path`.
+
+    Raises:
+        InvalidRequest: the path is a folder, or the suffix is unknown.
+    """
     suffix = path.suffix.lower()
     if path.is_dir():
         raise InvalidRequest(f"{path} is a folder", hint="`panelwright batch range FOLDER` analyses all of one")
@@ -170,6 +177,7 @@ def _loader(path: Path) -> Callable[[Path, Reading, bool], Loaded]:
 
 
 def _load_picture(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa: ARG001 - a picture holds one image
+    """Load a PNG or TIFF file; it has no sensor."""
     raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if raw is None:
         raise ValueError("no picture, or not all of it is there")
@@ -179,12 +187,13 @@ def _load_picture(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa:
 
 
 def _load_npy(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa: ARG001 - an array holds one image
+    """Load an npy file; it has no sensor."""
     with path.open("rb") as file:
         return _decoded(np.lib.format.read_array(file, allow_pickle=False), reading), None
 
 
 def _decoded(raw: NDArray[Any], reading: Reading) -> Array:
-    """Metres of a bare image: floats are metres, 16-bit codes millimetres, 8-bit codes need their window."""
+    """Convert a bare image to metres: floats are metres, 16-bit codes millimetres, 8-bit codes need their window."""
     if raw.dtype.kind == "f":
         return np.asarray(raw, float) * (reading.scale_m or 1.0)
     if reading.window is not None:
@@ -197,6 +206,7 @@ def _decoded(raw: NDArray[Any], reading: Reading) -> Array:
 
 
 def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
+    """Load an npz file, with its sensor if it holds one."""
     if path.stat().st_size and not zipfile.is_zipfile(path):
         raise ValueError("it is no zip archive, or not all of it is there")
     with np.load(path, allow_pickle=False) as data:
@@ -214,11 +224,12 @@ def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
 
 
 def _sensor_of_reading(data: Any) -> RangeSensorModel | None:
-    """What the reading of a scanner says of it: a sweep of beams says nothing."""
+    """Return the sensor in the metadata of a saved reading; None for a sweep of beams, which has none."""
     return sensor_from_meta(json.loads(str(data["meta"]))["sensor"], 1.0) if "meta" in data.files else None
 
 
 def _depth(data: Any, meta: dict[str, Any], unit: float, reading: Reading, codes: bool) -> Array:
+    """Return the depth in metres of an npz file with metadata, from `depth` or from the 8-bit codes."""
     if "depth" in data.files and not codes:
         raw = data["depth"]
         scale = reading.scale_m or unit
@@ -230,6 +241,7 @@ def _depth(data: Any, meta: dict[str, Any], unit: float, reading: Reading, codes
 
 
 def _meta_of_intrinsics(data: Any) -> dict[str, Any]:
+    """Return metadata in the form of `meta` for an npz file that has `K`, or neither."""
     if "K" not in data.files:
         return {"unit": "mm"}
     K = np.asarray(data["K"], float)
@@ -239,7 +251,7 @@ def _meta_of_intrinsics(data: Any) -> dict[str, Any]:
 
 
 def sensor_from_meta(meta: dict[str, Any], unit_m: float) -> RangeSensorModel:
-    """The sensor model of a recording's `meta.sensor`; `unit_m` metres a unit of `pitch`."""
+    """Return the sensor model of a recording's `meta.sensor`; `unit_m` is metres per unit of `pitch`."""
     h, w = (int(n) for n in meta["shape"])
     if meta["kind"] == "ortho":
         return OrthographicSensor(width_px=w, height_px=h, pixel_pitch_m=float(meta["pitch"]) * unit_m)

@@ -16,13 +16,13 @@ from perception.range.analysis import RangeScene
 from perception.range.matching.match import Match
 from perception.range.primitives import Surface
 
-MARK = ".surfaces"  # in the name of what is drawn of a recording, so that no batch takes it for one
-PICTURE_PX = 768  # small images are shown larger, or nobody could read what is written on them
-LEAST_WRITTEN_PX = 500
+MARK = ".surfaces"  # in the names of pictures drawn of a recording, so that a batch does not take them for recordings
+PICTURE_PX = 768  # smaller images are enlarged to about this size, so that text in them is legible
+LEAST_WRITTEN_PX = 500  # smaller surfaces in a picture get no text
 
 
 def scene_json(scene: RangeScene) -> dict[str, Any]:
-    """The scene as plain JSON values, SI units in the names, sensor frame."""
+    """Return the scene as plain JSON values, in SI units (named in the keys) and in the sensor frame."""
     return {
         "frame": "range_sensor",
         "noise_m_at_1_m": float(scene.noise.sigma_m(1.0)),
@@ -32,7 +32,7 @@ def scene_json(scene: RangeScene) -> dict[str, Any]:
 
 
 def surface_json(surface: Surface) -> dict[str, Any]:
-    """One surface: type, parameters, covariance with the names of its rows, and figures of fit."""
+    """Return type, parameters, covariance with the names of its rows, and residuals of one surface as JSON values."""
     parameters = {
         field.name: _plain(getattr(surface.primitive, field.name)) for field in dataclasses.fields(surface.primitive)
     }
@@ -50,7 +50,7 @@ def surface_json(surface: Surface) -> dict[str, Any]:
 
 
 def match_json(match: Match) -> dict[str, Any]:
-    """A component found: pose with covariance (6x6 as `UncertainPose`), which surface is which, state, free turns."""
+    """Return a match as JSON values: pose with covariance (6x6 as `UncertainPose`), surfaces, state, free turns."""
     pose = match.sensor_from_object
     return {
         "model": match.model,
@@ -64,13 +64,14 @@ def match_json(match: Match) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
+    """Return an array as a list, a boolean unchanged, and any other number as a float."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     return value if isinstance(value, bool) else float(value)
 
 
 def colours(count: int) -> NDArray[np.uint8]:
-    """(count + 1, 3) RGB colours, black for 0; neighbours in number differ in hue by the golden ratio."""
+    """Return RGB colours (count + 1, 3), black for 0; the hues of successive numbers differ by the golden ratio."""
     hue = (np.arange(count + 1) * 0.61803398875) % 1.0 * 179
     value = np.where(np.arange(count + 1) % 2, 230, 180)
     hsv = np.stack([hue, np.full(count + 1, 170), value], axis=1).astype(np.uint8)
@@ -80,7 +81,7 @@ def colours(count: int) -> NDArray[np.uint8]:
 
 
 def picture(scene: RangeScene) -> NDArray[np.uint8]:
-    """(sH, sW, 3) RGB image: one colour a surface, its number and type on it; small images are s times as large."""
+    """Return an RGB image (sH, sW, 3) with one colour per surface and its number and type; s enlarges small images."""
     labels = scene.labels
     scale = max(1, PICTURE_PX // max(labels.shape))
     image = np.kron(colours(len(scene.surfaces))[labels], np.ones((scale, scale, 1), np.uint8))
@@ -88,14 +89,17 @@ def picture(scene: RangeScene) -> NDArray[np.uint8]:
         inside = np.pad((labels == surface.label).astype(np.uint8), 1)
         if int(inside.sum()) * scale**2 < LEAST_WRITTEN_PX:
             continue
-        # Where the surface is widest: its middle may lie on another one that stands before it.
+        # The text goes where the surface is widest, because its middle may be hidden by another surface.
         _, radius_px, _, (u, v) = cv2.minMaxLoc(cv2.distanceTransform(inside, cv2.DIST_L2, 3))
         _write(image, surface, scale * (u - 1), scale * (v - 1), room_px=2.0 * scale * radius_px)
     return image
 
 
 def _write(image: NDArray[np.uint8], surface: Surface, u_px: int, v_px: int, *, room_px: float) -> None:
-    """White letters with a dark rim, so that they can be read on every colour; the type in short where it is narrow."""
+    """Write number and type of a surface around (u, v), in white letters with a dark rim.
+
+    `room_px`: width of the surface there; the type is shortened if it does not fit.
+    """
     text = f"{surface.label} {surface.type}"
     if cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)[0][0] > room_px:
         text = f"{surface.label} {str(surface.type)[:3]}"
@@ -106,7 +110,7 @@ def _write(image: NDArray[np.uint8], surface: Surface, u_px: int, v_px: int, *, 
 
 
 def write_png(path: Path, scene: RangeScene) -> None:
-    """Write `picture` as PNG."""
+    """Write `picture` as a PNG file."""
     done, data = cv2.imencode(".png", cv2.cvtColor(picture(scene), cv2.COLOR_RGB2BGR))
     if not done:
         raise OSError(f"cannot encode {path}")
@@ -114,7 +118,7 @@ def write_png(path: Path, scene: RangeScene) -> None:
 
 
 def write_ply(path: Path, scene: RangeScene, depth_m: Array) -> None:
-    """Write the valid points, metres in the sensor frame, coloured by surface, as binary PLY."""
+    """Write the valid points of an image, metres in the sensor frame, coloured by surface, as a binary PLY file."""
     points = scene.sensor.points(np.asarray(depth_m, float)).reshape(-1, 3)
     valid = np.isfinite(points[:, 2])
     records = np.empty(int(valid.sum()), [("xyz", "<f4", 3), ("rgb", "u1", 3)])

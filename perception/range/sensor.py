@@ -1,7 +1,7 @@
-"""Sensor models: how a depth image becomes rays and points.
+"""Sensor models, which give the ray of each pixel of a depth image.
 
-A pixel (u, v) with depth z stands for the point `O + z D` in the sensor frame (x right, y down, z away, metres).
-Depth is measured along the sensor's z axis, not as slant range.
+A pixel (u, v) with depth z is the point `O + z D` in the sensor frame (x right, y down, z away from the sensor, in
+metres); each model defines O and D. Depth is measured along the sensor's z axis, not along the ray.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hal.errors import InvalidRequest
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PinholeSensor:
-    """Central projection: O = 0, D = ((u - cx) / fx, (v - cy) / fy, 1). Focal lengths and centre in pixels."""
+    """Pinhole camera: O = 0, D = ((u - cx) / fx, (v - cy) / fy, 1). Focal lengths and image centre are in pixels."""
 
     width_px: int
     height_px: int
@@ -33,22 +33,22 @@ class PinholeSensor:
             )
 
     def packed(self) -> Array:
-        """(5,) perspective flag, fx, fy, cx, cy: what the compiled loops read."""
+        """Return perspective flag (1), fx, fy, cx and cy as an array (5,), the form that compiled loops read."""
         return np.array([1.0, self.fx_px, self.fy_px, self.cx_px, self.cy_px])
 
     def pitch_m(self, depth_m: float) -> float:
-        """Distance in metres between neighbouring pixels on a wall facing the sensor at `depth_m`."""
+        """Return the distance in metres between neighbouring pixels on a wall that faces the sensor at `depth_m`."""
         return depth_m / (0.5 * (self.fx_px + self.fy_px))
 
     def points(self, depth_m: Array) -> Array:
-        """(H, W, 3) points in the sensor frame, metres; NaN where the depth is NaN."""
+        """Return the points (H, W, 3) of a depth image in the sensor frame, metres; NaN where the depth is NaN."""
         x, y = _plane_coordinates(self)
         return np.stack([x * depth_m, y * depth_m, depth_m], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrthographicSensor:
-    """Parallel rays: O = ((u - (W-1)/2) pitch, (v - (H-1)/2) pitch, 0), D = (0, 0, 1); the paper's g(u, v)."""
+    """Parallel projection: O = ((u - (W-1)/2) pitch, (v - (H-1)/2) pitch, 0), D = (0, 0, 1); the paper's g(u, v)."""
 
     width_px: int
     height_px: int
@@ -61,16 +61,16 @@ class OrthographicSensor:
             )
 
     def packed(self) -> Array:
-        """(5,) perspective flag, 1/pitch, 1/pitch, cx, cy: what the compiled loops read."""
+        """Return perspective flag (0), 1 / pitch (twice), cx and cy as (5,), the form that compiled loops read."""
         per_metre = 1.0 / self.pixel_pitch_m
         return np.array([0.0, per_metre, per_metre, (self.width_px - 1) / 2, (self.height_px - 1) / 2])
 
     def pitch_m(self, depth_m: float) -> float:  # noqa: ARG002 - the same at every depth
-        """Distance in metres between neighbouring pixels."""
+        """Return the distance in metres between neighbouring pixels."""
         return self.pixel_pitch_m
 
     def points(self, depth_m: Array) -> Array:
-        """(H, W, 3) points in the sensor frame, metres; NaN where the depth is NaN."""
+        """Return the points (H, W, 3) of a depth image in the sensor frame, metres; NaN where the depth is NaN."""
         x, y = _plane_coordinates(self)
         return np.stack([np.where(np.isnan(depth_m), np.nan, v) for v in (x, y)] + [depth_m], axis=-1)
 
@@ -79,6 +79,7 @@ RangeSensorModel = PinholeSensor | OrthographicSensor
 
 
 def _plane_coordinates(sensor: RangeSensorModel) -> tuple[Array, Array]:
+    """Return the ray coordinates x, y (H, W): on the plane z = 1 (pinhole) or in metres (orthographic)."""
     _, fx, fy, cx, cy = sensor.packed()
     v, u = np.mgrid[: sensor.height_px, : sensor.width_px].astype(float)
     return (u - cx) / fx, (v - cy) / fy

@@ -1,8 +1,9 @@
-"""Whether flat faces come out straight under the sensor model that was given, or only under another one.
+"""Test of the sensor model: flat faces are straight only under the right one.
 
-A plane is linear over the image in 1/z for a pinhole, in z for parallel rays, and in r/z, where r is the length of the
-ray (x, y, 1), when what is stored is the distance along each ray. Under a wrong one every tilted face is bent. Only
-windows that some model makes straight vote, each with the log-likelihood that a quadratic gains over a line.
+Over the image of a plane the inverse depth 1/z is linear for a pinhole, z for parallel rays, and r/z if the distance
+along each ray is stored instead of the depth, with r the length of the ray (x, y, 1). Under a wrong model every tilted
+face appears bent. Only windows that are straight under some model count, each with the log-likelihood that a quadratic
+gains over a plane.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from perception.range.noise import quadratics, window_rms
 from perception.range.sensor import RangeSensorModel
 
 SIDE = 9  # samples across a window
-WINDOWS_ACROSS = 3  # of the shorter side; windows overlap by half
-STRAIGHT_GAIN = 8.0  # of three parameters more; noise alone gives 1.5
-MARGIN = 40.0
-SHARE = 0.5  # the other model must leave no more bend than this
-PRECISION = 1e-6  # of the depth: what is straighter is straight
+WINDOWS_ACROSS = 3  # windows side by side along the shorter side; neighbouring windows overlap by half
+STRAIGHT_GAIN = 8.0  # largest gain in a straight window, from three more parameters; noise alone gives 1.5
+MARGIN = 40.0  # by which the total gain under the given model must exceed that under the other model
+SHARE = 0.5  # largest total gain under the other model, relative to that under the given one
+PRECISION = 1e-6  # of the depth; smaller residuals do not count
 BASIS = quadratics(SIDE)
 
 PARALLEL = "flat faces are straight in depth as rays in parallel give them (or the image holds disparities)"
@@ -27,10 +28,10 @@ DISTANCE = "flat faces are straight once depth is taken as the distance along ea
 
 
 def doubt_about(depth_m: Array, sensor: RangeSensorModel) -> str | None:
-    """A sentence that names a sensor model under which the (H, W) image's flat faces are straight, if not under this.
+    """Return a sentence that names another sensor model if flat faces are straight under that one only.
 
-    None when they are straight under the one given, or when the image does not tell. A wrong focal length keeps planes
-    straight and is not seen.
+    None if they are straight under the given model, or if the (H, W) image does not tell. A wrong focal length keeps
+    planes straight and is not detected.
     """
     is_pinhole = bool(sensor.packed()[0] > 0)
     few = max(1, min(depth_m.shape) // (WINDOWS_ACROSS * (SIDE - 1)))
@@ -48,14 +49,17 @@ def doubt_about(depth_m: Array, sensor: RangeSensorModel) -> str | None:
 
 
 def _ray_lengths(sensor: RangeSensorModel, few: int) -> Array:
-    """Length of the ray (x, y, 1) through every so manieth pixel."""
+    """Return the lengths of the rays (x, y, 1) through every `few`-th pixel of every `few`-th row."""
     _, fx, fy, cx, cy = sensor.packed()
     x, y = (np.arange(0, sensor.width_px, few) - cx) / fx, (np.arange(0, sensor.height_px, few) - cy) / fy
     return np.asarray(np.sqrt(x**2 + y[:, None] ** 2 + 1.0))
 
 
 def _bends(g: Array, is_inverse: bool) -> Array:
-    """For each complete window the log-likelihood that a quadratic gains over a plane, in the linear quantity g."""
+    """Return for each complete window the log-likelihood that a quadratic gains over a plane, in the linear quantity g.
+
+    `is_inverse`: whether g is an inverse depth.
+    """
     if min(g.shape) < SIDE:
         return np.zeros(0)
     z, flat, bent = window_rms(g, BASIS, 3, 1, SIDE // 2, is_inverse)

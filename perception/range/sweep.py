@@ -1,6 +1,8 @@
-"""Depth image from a line scanner that the wrist sweeps: each beam is placed where the scanner was when it measured.
+"""Depth image from a line scanner that the arm sweeps: each beam is placed with the scanner's pose at its own time.
 
-base_point = base_from_scanner(t) r (sin a, 0, cos a),   t = end of scan - (1 - a's part of a turn) T
+base_point = base_from_scanner(t) r (sin a, 0, cos a),   t = end of scan - |last beam's angle - a| T / (2 pi)
+
+r is the range of a beam, a its angle in the scan plane, and T the period of the scanner's rotation.
 """
 
 from __future__ import annotations
@@ -21,16 +23,16 @@ from hal.readings import Quality, Stamped
 from perception.range.from_points import image_from_points
 from perception.range.sensor import PinholeSensor
 
-LONGEST_GAP_S = 0.1  # between two poses: at 1 m/s^2 the path bends 1.3 mm away from the straight line meanwhile
-KNOTS = 9  # poses per scan; beams between two of them are placed by interpolation
+LONGEST_GAP_S = 0.1  # between two poses; at 1 m/s^2 the path deviates at most 1.3 mm from a straight line in this time
+KNOTS = 9  # poses per scan; the poses of beams between two of them are interpolated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScannerTrack:
-    """Where the scanner was during a sweep.
+    """Poses of the scanner during a sweep.
 
     Attributes:
-        times_s: rising times on the cell's clock.
+        times_s: increasing times on the cell's clock.
         base_from_scanner: the pose at each of them.
     """
 
@@ -38,7 +40,7 @@ class ScannerTrack:
     base_from_scanner: Sequence[RigidTransform]
 
     def at(self, time_s: float) -> RigidTransform:
-        """The pose at a time between two known ones.
+        """Return the pose at a time between two known ones, interpolated.
 
         Raises:
             StaleReading: the time lies outside the track or in a gap of it.
@@ -56,7 +58,7 @@ class ScannerTrack:
         return interpolate(self.base_from_scanner[after - 1], self.base_from_scanner[after], fraction)
 
     def covers(self, start_s: float, end_s: float) -> bool:
-        """Are there poses from before `start_s` until after `end_s`?"""
+        """Return whether poses are known from `start_s` or before until `end_s` or after."""
         return bool(len(self.times_s)) and self.times_s[0] <= start_s and end_s <= self.times_s[-1]
 
 
@@ -69,19 +71,19 @@ def image_from_sweep(
     base_from_view: RigidTransform,
     half_height_rad: float,
 ) -> tuple[Array, PinholeSensor]:
-    """Depth (H, W), m, and geometry of the image that a range camera at `base_from_view` would have taken.
+    """Return depth (H, W) in metres and geometry of the image that a range camera at `base_from_view` would have taken.
 
-    Scans of which not every beam has a known pose are left out. A pixel is as wide as the step between two beams in the
-    middle of the image, and as high as the turn between two scans.
+    Only scans with a known pose for every beam are used. A pixel is as wide as the step between two beams in the middle
+    of the image, and as high as the rotation between two scans.
 
     Args:
-        times_s: rising times on the cell's clock at which the scanner's pose is known.
+        times_s: increasing times on the cell's clock at which the scanner's pose is known.
         base_from_scanner: the pose at each of them.
         base_from_view: usually the scanner's pose half way through the sweep.
         half_height_rad: half of the angle that was swept about the scanner's x axis.
 
     Raises:
-        InvalidRequest: not the scans of a line scanner.
+        InvalidRequest: the scans are not those of a line scanner.
         NotFound: no point falls into the view.
         StaleReading: the known poses have a gap.
     """
@@ -107,20 +109,20 @@ def image_from_sweep(
 
 
 def beam_times_s(end_s: float, c: RangeScannerCapabilities) -> Array:
-    """When each beam was measured: the scanner turns steadily, and the last beam ends the scan.
+    """Return the time at which each beam was measured: the scanner rotates steadily, and the last beam ends the scan.
 
     Args:
-        end_s: stamp of the scan, as the drivers of line scanners give it.
+        end_s: time stamp of the scan, as the drivers of line scanners give it.
     """
     before_s = (c.width - 1 - np.arange(c.width)) * abs(c.step_angle_rad) / (math.tau * c.rate_hz)
     return np.asarray(end_s - before_s, np.float64)
 
 
 def scan_points(scan: Stamped[RangeImage], c: RangeScannerCapabilities, track: ScannerTrack) -> Array:
-    """The (n, 3) points of one scan in the base frame, m; beams that saw nothing are left out.
+    """Return the points (n, 3) of one scan in the base frame, metres, without beams that measured nothing.
 
     Raises:
-        InvalidRequest: not a line scanner's scan.
+        InvalidRequest: the scan is not that of a line scanner.
         StaleReading: the track does not cover the scan.
     """
     if not c.needs_sweep:
@@ -135,7 +137,10 @@ def scan_points(scan: Stamped[RangeImage], c: RangeScannerCapabilities, track: S
 
 
 def _in_base(in_scanner: Array, times_s: Array, track: ScannerTrack) -> Array:
-    """Points in the base frame, each with the pose of its own time: moved linearly between knots, turned exactly."""
+    """Transform points (n, 3) to the base frame, each with the scanner's pose at its own time.
+
+    Between knots the translation is interpolated linearly, and the rotation about a fixed axis.
+    """
     knots_s = np.linspace(times_s[0], times_s[-1], KNOTS)
     poses = [track.at(float(knot_s)) for knot_s in knots_s]
     place = np.clip(np.searchsorted(knots_s, times_s) - 1, 0, KNOTS - 2)

@@ -1,4 +1,4 @@
-"""Horizontal tiles of an image, which share the work on its pixels."""
+"""Division of an image into horizontal tiles, whose pixels are processed in parallel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 
 def tile_rows(rows: int, tiles: int) -> list[tuple[int, int]]:
-    """Row ranges [top, bottom) of at most `tiles` horizontal tiles, none empty."""
+    """Return the row ranges [top, bottom) of at most `tiles` horizontal tiles, none of them empty."""
     count = min(max(tiles, 1), max(rows, 1))
     return [(rows * k // count, rows * (k + 1) // count) for k in range(count)]
 
@@ -15,7 +15,7 @@ def tile_rows(rows: int, tiles: int) -> list[tuple[int, int]]:
 def for_each_tile(
     work: Callable[[int, int], object], rows: int, tiles: int, *, pool: ThreadPoolExecutor | None
 ) -> None:
-    """Call `work(top, bottom)` for every tile, on the pool's threads when one is given."""
+    """Call `work(top, bottom)` for every tile, on the threads of `pool` if there is one."""
     if tiles == 1:
         work(0, rows)
         return

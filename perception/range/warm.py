@@ -1,4 +1,4 @@
-"""Compile everything once, so that no caller waits for it later."""
+"""Compilation of all range kernels in advance, so that no later call waits for the compiler."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ SIDE_PX = 200  # large enough that the coarse and the fine grid both run
 
 
 def warm_up() -> None:
-    """Run the whole chain on small made-up scenes; compiled code is cached on disk for the next process."""
+    """Analyse small synthetic scenes so that every kernel is compiled.
+
+    Compiled code is cached on disk, so other processes need not compile again.
+    """
     pinhole = PinholeSensor(width_px=SIDE_PX, height_px=SIDE_PX, fx_px=200.0, fy_px=200.0, cx_px=99.5, cy_px=99.5)
     parallel = OrthographicSensor(width_px=SIDE_PX, height_px=SIDE_PX, pixel_pitch_m=0.001)
     v, u = np.mgrid[:SIDE_PX, :SIDE_PX] * 0.001
@@ -28,5 +31,5 @@ def warm_up() -> None:
     for sensor in sensors:
         scene = analyse(depth, sensor)
         match_models(scene, depth, shipped_models()[:1])
-    analyse(depth + 10.0 * noise, pinhole)  # coarse: what only averages tell
+    analyse(depth + 10.0 * noise, pinhole)  # so noisy that larger blocks are used
     fit_plane_near(depth, pinhole, point_m=[0.0, 0.0, 0.61], normal=[0.0, 0.0, -1.0])

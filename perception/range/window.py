@@ -1,6 +1,6 @@
-"""Depth from the integer codes of a range sensor (paper, Fig. 7).
+"""Conversion of the integer codes of a range sensor to depth (paper, Fig. 7).
 
-A code c of a linear window stands for `near + c (far - near) / levels`, 0 near.
+A code c of a linear window stands for the depth `near + c (far - near) / levels`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hal.errors import InvalidRequest
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Window:
-    """A linear mapping of depth to codes: `near_m` at code 0, `far_m` at code `levels`."""
+    """Linear mapping of depth to codes: `near_m` at code 0, `far_m` at code `levels`."""
 
     near_m: float
     far_m: float
@@ -31,11 +31,11 @@ class Window:
 
     @property
     def step_m(self) -> float:
-        """Depth between neighbouring codes."""
+        """Difference in depth between neighbouring codes."""
         return (self.far_m - self.near_m) / self.levels
 
     def decode(self, codes: ArrayLike, *, invalid: int | None = None) -> Array:
-        """Depth in metres, float64, of integer codes of any shape; `invalid` codes become NaN."""
+        """Return the depth in metres, as float64, of integer codes of any shape; the code `invalid` becomes NaN."""
         raw = np.asarray(codes)
         if raw.dtype.kind not in "iu":
             raise InvalidRequest(f"codes must be integers, not {raw.dtype}", hint="pass the coded image itself")
@@ -46,7 +46,10 @@ class Window:
 
 
 def decode_scaled(codes: ArrayLike, scale_m: float, *, invalid: int = 0) -> Array:
-    """Depth in metres of integer codes of `scale_m` metres each (0.001 for millimetre images); `invalid` is NaN."""
+    """Return the depth in metres of integer codes; the code `invalid` becomes NaN.
+
+    `scale_m`: metres per code, 0.001 for images in millimetres.
+    """
     if not (scale_m > 0 and np.isfinite(scale_m)):
         raise InvalidRequest(f"scale of {scale_m} m a code is not positive", hint="0.001 for millimetres")
     raw = np.asarray(codes)

@@ -49,16 +49,16 @@ from perception.range.fitting.surfaces import (
     step_into,
 )
 
-TRIM_SIGMAS = 3.0
+TRIM_SIGMAS = 3.0  # samples with larger residuals are outliers in the final least squares
 PER_MEDIAN = 1.4826  # standard deviation of a normal distribution per median of its absolute value
-SCALE_PRECISION = 0.004
+SCALE_PRECISION = 0.004  # relative precision of `middle_scale`
 FALLS = 0.95  # another round with Cauchy weights follows only if the scale falls below this share of the previous one
-ROUGH_SAMPLES = 36
-ROUGH_LIMIT = 5.0
-ROUGH_STEPS = as_numpy_scalar(2)
+ROUGH_SAMPLES = 36  # used by the rough fit that precedes a full one
+ROUGH_LIMIT = 5.0  # sigmas; residuals of the rough fit are capped at this
+ROUGH_STEPS = as_numpy_scalar(2)  # per round of the rough fit
 # No ellipsoid is tried if the mean square of the simpler kinds exceeds this: a sphere is then no good initial guess.
 ELLIPSOID_GIVE_UP = 14.0
-LARGEST_RADIUS_M = 10.0
+LARGEST_RADIUS_M = 10.0  # fits of spheres and cylinders with a larger radius are rejected
 LEAST_NORMALS = 10  # normals needed to start any kind but a plane
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 per sample plus its parameter penalty
 STEP_GOAL = 1e-3  # in standard deviations of each parameter: smaller steps are negligible
@@ -70,8 +70,9 @@ AROUND_ZERO, AROUND_MEAN = as_numpy_scalar(False), as_numpy_scalar(True)  # cent
 def new_scratch(samples: int) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
     """Allocate the work arrays of a fit to at most `samples` samples.
 
-    In order: rows of `rays`, matrix (9, 9) and gradient (9,) of the current and of the trial parameters, matrix and
-    vector of a step, tangent frames of the current and of the trial parameters, trial parameters, residuals.
+    In this order: the rows of `rays`; matrix (9, 9) and gradient (9,) of the current parameters, and of the trial
+    parameters; matrix and vector of a step; tangent frames of the current and of the trial parameters; trial
+    parameters; residuals.
     """
     small = np.empty(3 * 81 + 3 * 9 + 2 * 6 + SIZE)  # one allocation instead of nine
     H, H2, A = small[:81].reshape((9, 9)), small[81:162].reshape((9, 9)), small[162:243].reshape((9, 9))
@@ -144,7 +145,10 @@ def refine(
 
 @compiled
 def damped(H: Array, g: Array, fixed: Mask, damping: float, p: int, A: Array, step: Array) -> None:
-    """Write the damped linear system of one step into `A` (p, p) and `step` (p,); fixed parameters get a zero step."""
+    """Write the damped linear system of one step into `A` (p, p) and `step` (p,); fixed parameters get a zero step.
+
+    `H` and `g` are the Gauss-Newton matrix and gradient; the diagonal of `H` is multiplied by 1 + `damping`.
+    """
     for a in range(p):
         for b in range(p):
             A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
@@ -213,7 +217,9 @@ def fit_robust(
 ) -> tuple[Array, float]:  # fmt: skip
     """Fit with Cauchy weights whose scale falls with the residuals, then with trimmed least squares.
 
-    Returns the parameters and the trimmed cost.
+    Returns the parameters and the trimmed cost: the sum of squared residuals in squared sigmas, each at most
+    `TRIM_SIGMAS` squared. `th` holds the initial parameters, `fixed` (9,) tells which of them stay, and `rounds` is the
+    largest number of rounds with Cauchy weights.
     """
     th, scratch = th.copy(), new_scratch(x.shape[0])
     _, _, cost = _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch)
@@ -315,7 +321,7 @@ def fit_kinds(
             cost = _rough(kind, starts[kind], rx, ry, rz, rs, perspective, free, scratch)
             rough[kind] = cost / correlated_samples
             best_rough = min(best_rough, rough[kind])
-    # A kind whose rough cost is clearly above the best one cannot win.
+    # A kind whose rough cost is clearly above the best one cannot have the best score.
     behind = 2.0 * best_rough + 0.5 * per_sample
     give_up = give_up * per_sample
     for kind in range(QUADRIC):
@@ -359,7 +365,7 @@ def _start(kind: int, points: Array, P: Array, N: Array, th: Array) -> bool:
 
 @compiled
 def _is_sane(kind: int, th: Array) -> bool:
-    """Whether the radius, or the half angle of a cone, is within the accepted range."""
+    """Return whether the radius, or the half angle of a cone, is within the accepted range."""
     if kind == CYLINDER:
         return bool(th[6] < LARGEST_RADIUS_M)
     if kind == SPHERE:

@@ -1,4 +1,7 @@
-"""Initial parameters of fits by algebraic fits to points and normals, with the small linear algebra they need."""
+"""Initial parameters of fits, by algebraic fits to points and normals, with the small linear algebra that they need.
+
+`P` (N, 3) are points and `N` (N, 3) their unit normals towards the sensor.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix converges in four or five
 
 @compiled
 def solve_positive(A: Array, b: Array, p: int) -> bool:
-    """Solve A x = b by Cholesky, overwriting both; False when A is not positive definite."""
+    """Solve A x = b (p unknowns) by Cholesky decomposition; returns False if A is not positive definite.
+
+    Overwrites `A` with the factor and `b` with the solution.
+    """
     for i in range(p):
         top = A[i, i]
         for j in range(i + 1):
@@ -41,7 +47,7 @@ def solve_positive(A: Array, b: Array, p: int) -> bool:
 
 @compiled
 def principal_axes(S: Array) -> tuple[Array, Array]:
-    """Eigenvalues (3,), smallest first, and eigenvectors (3, 3) in columns, of a symmetric matrix.
+    """Return eigenvalues (3,), smallest first, and eigenvectors (3, 3), in columns, of a symmetric matrix.
 
     Uses cyclic Jacobi rotations (Golub and Van Loan, 8.5), ten times as fast as a LAPACK call at this size.
     """
@@ -78,7 +84,7 @@ def principal_axes(S: Array) -> tuple[Array, Array]:
 
 @compiled
 def centroid(P: Array) -> Array:
-    """Mean of points (N, 3)."""
+    """Return the mean (3,) of points (N, 3)."""
     c = np.zeros(3)
     n = P.shape[0]
     for i in range(n):
@@ -91,7 +97,7 @@ def centroid(P: Array) -> Array:
 
 @compiled
 def scatter(P: Array, c: Array) -> Array:
-    """Scatter matrix (3, 3) of points (N, 3) about c: the sum of (P_i - c)(P_i - c)'."""
+    """Return the scatter matrix (3, 3) of points (N, 3) about c: the sum of (P_i - c)(P_i - c)'."""
     S = np.zeros((3, 3))
     for i in range(P.shape[0]):
         x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
@@ -149,7 +155,10 @@ def _side(P: Array, N: Array, th: Array, axis: Array) -> float:
 
 @compiled
 def start_sphere(P: Array, N: Array) -> tuple[Array, bool]:
-    """Fit a sphere algebraically, |X|^2 = 2 c . X + k about the centroid; the normals give the side."""
+    """Fit a sphere algebraically, |X|^2 = 2 c . X + k about the centroid; the normals determine the side.
+
+    Returns the parameters, and whether there is a solution.
+    """
     th = np.zeros(SIZE)
     c = centroid(P)
     n = P.shape[0]
@@ -183,7 +192,10 @@ def normal_axis(N: Array, centred: bool) -> Array:
 
 @compiled
 def start_cylinder(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
-    """Fit a cylinder of known axis: an algebraic circle through the points projected along `axis`."""
+    """Fit a cylinder with a known axis direction: an algebraic circle through the points projected along `axis`.
+
+    Returns the parameters, and whether there is a solution.
+    """
     th = np.zeros(SIZE)
     e = tangent_frame(axis[0], axis[1], axis[2])
     c = centroid(P)
@@ -207,7 +219,10 @@ def start_cylinder(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
 
 @compiled
 def start_cone(P: Array, N: Array, axis: Array) -> tuple[Array, bool]:
-    """Fit a cone algebraically: the apex from n . X = n . apex, the angle from n . axis = -sin(angle)."""
+    """Fit a cone algebraically: the apex from n . X = n . apex, the angle from n . axis = -sin(angle).
+
+    Returns the parameters, and whether there is a solution.
+    """
     th = np.zeros(SIZE)
     c = centroid(P)
     n = P.shape[0]
@@ -241,7 +256,7 @@ def quadric_of_sphere(th: Array) -> Array:
 
 @compiled
 def is_ellipsoid(th: Array) -> bool:
-    """Whether the quadric is a real ellipsoid whose longest radius is less than 8 times the shortest."""
+    """Return whether the quadric is a real ellipsoid whose longest radius is less than 8 times the shortest."""
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
     )

@@ -91,10 +91,11 @@ def _load(depth: Array, first: int, row: int, sen: Array, work: Array) -> None:
 def _add_plane(
     th: Array, frame: Array, n: int, perspective: bool, work: Array, H: Array, g: Array,
 ) -> tuple[float, float]:  # fmt: skip
-    """Do `fill_rows` and `add_equations` for a plane in one loop without a square root, because most pixels lie on planes.
+    """Do the work of `fill_rows` and `add_equations` for a plane in one loop without a square root.
 
-    Row SIGMA holds variances here. Adds w^2 J'J to `H` and w^2 J'r to `g`, with the squared weight
-    w^2 = min(1, (c / GRAZING_COSINE)^2) / sigma^2 and c the cosine of incidence.
+    Most pixels lie on planes, so this case is worth a loop of its own. Row SIGMA holds variances here. Adds w^2 J'J to
+    `H` and w^2 J'r to `g`, with the squared weight w^2 = min(1, (c / GRAZING_COSINE)^2) / sigma^2 and c the cosine of
+    incidence.
     """
     p, limit = 1.0 if perspective else 0.0, TRIM_SIGMAS * TRIM_SIGMAS
     nx, ny, nz, d = th[0], th[1], th[2], th[3]

@@ -13,7 +13,7 @@ from hal.arrays import Array
 from hal.jit import REORDERED, compiled
 from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, GRAZING_COSINE, PLANE, SPHERE, frame_of
 
-CHUNK = 160  # samples; `merge` fits this many at once
+CHUNK = 160  # number of samples in a chunk; `merge` fits this many at once
 ROWS = [row * CHUNK for row in range(18)]  # where each row of the scratch array begins
 DEPTH, COSINE = ROWS[:2]
 D0, D1, D2, D3, D4, D5, D6, D7, D8 = ROWS[2:11]  # derivatives of depth with respect to the tangent parameters
@@ -68,7 +68,7 @@ def fill_rows(kind: int, th: Array, frame: Array, n: int, perspective: bool, wor
 
 @compiled(fastmath=REORDERED)
 def _plane(th: Array, frame: Array, n: int, p: float, work: Array) -> None:
-    """Fill the rows for a plane; `p` is 1 for perspective rays and 0 for parallel ones, here and below."""
+    """Fill the rows for a plane; `p`, here and below, is 1 for perspective rays and 0 for parallel ones."""
     nx, ny, nz, d = th[0], th[1], th[2], th[3]
     e0, e1, e2, f0, f1, f2 = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
     for i in range(n):
@@ -271,7 +271,7 @@ def _cauchy_weights(n: int, c2: float, work: Array) -> float:
 
 @compiled(fastmath=REORDERED)
 def _sum_of_logarithms(values: Array) -> float:
-    """Sum of ln(values), with one logarithm per product of eight values because logarithms are slow."""
+    """Return the sum of ln(values), with one logarithm per product of eight values because logarithms are slow."""
     total = 0.0
     n = values.shape[0]
     whole = n // 8 * 8
@@ -302,7 +302,7 @@ def _trim_weights(n: int, trim: float, work: Array) -> tuple[float, float]:
 
 @compiled(fastmath=REORDERED)
 def _dot(a: Array, b: Array) -> float:
-    """Dot product whose order of summation the compiler may change."""
+    """Return the dot product of two rows; the compiler may change the order of summation."""
     total = 0.0
     for i in range(a.shape[0]):
         total += a[i] * b[i]
@@ -404,7 +404,7 @@ def residuals_by_chunks(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, frame: Array, work: Array,
     out: Array,
 ) -> None:  # fmt: skip
-    """Do the same as `residuals`, with `frame` (6,) and `work` (SCRATCH,) as work arrays, which are overwritten."""
+    """Compute `residuals` with the work arrays `frame` (6,) and `work` (SCRATCH,), which are overwritten."""
     frame_of(kind, th, frame)
     count = x.shape[0]
     for first in range(0, count, CHUNK):

@@ -8,8 +8,11 @@ A surface is a kind and a parameter vector of 16 numbers:
     CONE       apex (3), axis (3), angle, side   angle between X - apex and the axis (into the cone) = angle
     QUADRIC    centre (3), scale, then 10 coefficients over (xx, yy, zz, xy, xz, yz, x, y, z, 1) of (X - centre) / scale
 
-`side` is +1 for a surface seen from outside (the nearer root along the ray) and -1 from inside.
-Fits take steps in a tangent space: shifts across the axis, and tilts of unit vectors in the frame of `tangent_frame`.
+`side` is +1 for a surface seen from outside (the nearer root along the ray) and -1 from inside. A ray is given by its
+coordinates x, y on the plane z = 1 (`perspective`) or in metres (parallel rays).
+
+Fits change the tangent parameters of a surface: shifts, tilts of its unit vector towards the two vectors of
+`tangent_frame`, and its sizes. `FREEDOM` is their number; `step_into` defines their order.
 """
 
 # ruff: noqa: PLR0912, PLR1714, SIM109 - compiled loops take plain arrays, and long
@@ -23,13 +26,13 @@ from hal.jit import as_numpy_scalar, compiled
 
 PLANE, SPHERE, CYLINDER, CONE, QUADRIC = (as_numpy_scalar(kind) for kind in range(5))
 SIZE = 16
-FREEDOM = np.array([3, 4, 5, 6, 9])
+FREEDOM = np.array([3, 4, 5, 6, 9])  # number of tangent parameters of each kind
 GRAZING_COSINE = 0.3  # below it pixels lose weight, because a depth residual there says little about the surface
 
 
 @compiled
 def tangent_frame(ax: float, ay: float, az: float) -> tuple[float, float, float, float, float, float]:
-    """Two unit vectors that complete (ax, ay, az) to a right-handed frame."""
+    """Return two unit vectors that complete the unit vector (ax, ay, az) to a right-handed frame."""
     if abs(ax) < 0.8:
         ux, uy, uz = 0.0, az, -ay
     else:
@@ -55,7 +58,7 @@ def _roots(a: float, b: float, c: float, side: float) -> float:
 
 @compiled
 def depth_on(kind: int, th: Array, x: float, y: float, perspective: bool) -> float:
-    """Depth z where the ray of (x, y) meets the surface; NaN where it does not."""
+    """Return the depth z at which the ray (x, y) meets the surface; NaN if it does not."""
     if perspective:
         ox, oy, dx, dy = 0.0, 0.0, x, y
     else:
@@ -139,7 +142,7 @@ def depths_on(kind: int, th: Array, x: Array, y: Array, perspective: bool, out: 
 
 @compiled
 def normal_on(kind: int, th: Array, px: float, py: float, pz: float) -> tuple[float, float, float]:
-    """Unit gradient of the surface at a point on it (not oriented)."""
+    """Return the unit gradient of the surface at a point on it; it is not turned towards the sensor."""
     if kind == PLANE:
         return th[0], th[1], th[2]
     wx, wy, wz = px - th[0], py - th[1], pz - th[2]
@@ -177,9 +180,10 @@ def normals_on(kind: int, th: Array, x: Array, y: Array, z: Array, perspective: 
 def depth_and_jacobian(
     kind: int, th: Array, frame: Array, x: float, y: float, perspective: bool, J: Array,
 ) -> tuple[float, float]:  # fmt: skip
-    """Return depth and cosine of incidence of a ray; fill J with dz / d(tangent parameters).
+    """Return depth and cosine of incidence of a ray; fills `J` (9,) with the derivatives dz / d(tangent parameters).
 
     On the surface F = 0 the derivative is dz / dtheta = -(dF/dtheta) / (dF/dz). Depth is NaN where the ray misses.
+    `frame` is that of `frame_of`.
     """
     z = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(z):
@@ -248,9 +252,9 @@ def frame_of(kind: int, th: Array, frame: Array) -> None:
 
 @compiled
 def step_into(kind: int, th: Array, frame: Array, step: Array, out: Array) -> None:
-    """Write the parameters after a tangent step into `out`.
+    """Write the parameters after a step (9,) of the tangent parameters into `out` (16,).
 
-    Unit vectors stay unit vectors, and a quadric keeps the trace of its matrix.
+    Unit vectors remain unit vectors, and a quadric keeps the trace of its matrix.
     """
     for i in range(SIZE):
         out[i] = th[i]

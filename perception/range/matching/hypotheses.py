@@ -19,15 +19,15 @@ Flags = NDArray[np.bool_]
 
 LEAST_HEIGHT_M = 0.002
 LEAST_PIXELS = 12
-LEAST_SHARE = 0.3  # of a surface's pixels; of the panel itself a smaller share stands out, by noise and relief
-HEIGHT_SLACK_M = 0.004
-LYING = 0.15  # a direction has a heading if its projection on the panel is longer than this
-ELONGATED = 1.5
-SAME_TURN_RAD = 0.09
+LEAST_SHARE = 0.3  # of a surface's pixels must stand out; of the panel itself fewer do, because of noise and relief
+HEIGHT_SLACK_M = 0.004  # accepted difference between the heights of a piece and of a model surface
+LYING = 0.15  # least length of a direction's projection on the panel that determines a heading
+ELONGATED = 1.5  # least ratio of length to width of a shape whose longer side determines a heading
+SAME_TURN_RAD = 0.09  # angles that differ by less are tried only once
 BLIND_TURNS = 8  # headings tried per period of symmetry if the data do not give one
-STATES = 7
-NORMAL_SLACK_RAD = 0.35
-LEAST_FACING = 0.3
+STATES = 7  # positions that are tried of a part that slides along the panel
+NORMAL_SLACK_RAD = 0.35  # accepted angle between the normals of a plane in the scene and in the model
+LEAST_FACING = 0.3  # least z of the normal of a face that suggests poses
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,7 +157,7 @@ def hypotheses(candidate: Candidate, piece: Piece) -> list[Array]:
 
 
 def _faces_alike(surface: ModelSurface, piece: Piece, yaw: float) -> bool:
-    """Whether the normals of two planes agree after a rotation by `yaw`; True if either is not a plane."""
+    """Return whether the normals of two planes agree after a rotation by `yaw`; True if either is not a plane."""
     if surface.type != Form.PLANE or not piece.is_plane:
         return True
     c, s = np.cos(yaw), np.sin(yaw)

@@ -58,13 +58,13 @@ class Match:
 def match_models(
     scene: RangeScene, depth_m: Array, models: Sequence[ComponentModel], *, panel: Surface | None = None
 ) -> tuple[Match, ...]:
-    """Components on a panel, best first; each pixel belongs to at most one.
+    """Find the components that stand on a panel, best first; each pixel belongs to at most one of them.
 
     Args:
         scene: result of `analyse`.
-        depth_m: (H, W) the image that the scene came from.
-        models: the library.
-        panel: the plane that components stand on; the scene's largest plane by default.
+        depth_m: (H, W) the image that was analysed.
+        models: the kinds of components to look for.
+        panel: the plane on which components stand; the scene's largest plane by default.
 
     Raises:
         NotFound: no panel is given and the scene shows no plane.
@@ -90,7 +90,10 @@ def match_models(
 
 
 def view_of(scene: RangeScene, depth_m: Array, base: Surface) -> View:
-    """Prepare the image for comparison with hypotheses, in the panel's frame: z outward, x the sensor's x in the panel."""
+    """Prepare the image for comparison with hypotheses in the panel's frame.
+
+    In that frame z is the outward normal, and x is the sensor's x axis projected into the panel.
+    """
     plane = base.primitive
     if not isinstance(plane, Plane):
         raise TypeError(f"surface {base.label} is a {base.type}, not a plane")
@@ -114,7 +117,7 @@ def view_of(scene: RangeScene, depth_m: Array, base: Surface) -> View:
 
 
 def _holds(counts: Array) -> bool:
-    """Whether enough pixels agree with a hypothesis, in number and as a share, to accept it as a match."""
+    """Return whether enough pixels agree with a hypothesis, in number and as a share, to accept it as a match."""
     against = counts[BEHIND] + counts[RING]
     return bool(
         counts[HITS] >= LEAST_PIXELS

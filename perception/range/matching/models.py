@@ -82,7 +82,8 @@ class ComponentModel:
 
     Attributes:
         turns: order of the rotational symmetry about z; 0 for full symmetry, where the angle cannot be determined.
-        motion: of the moving part: slide along `motion_axis` or turn about it, from `low` to `high` (m or rad).
+        motion, motion_axis: whether the moving part slides along the axis (3,) or turns about it.
+        low, high: limits of that motion, m or rad.
     """
 
     name: str
@@ -95,7 +96,7 @@ class ComponentModel:
 
     @property
     def period_rad(self) -> float:
-        """The smallest turn about z after which the component looks the same; 0 when every turn does."""
+        """Smallest rotation about z after which the component looks the same; 0 if it looks the same after any."""
         return 2.0 * math.pi / self.turns if self.turns else 0.0
 
 
@@ -127,7 +128,7 @@ MODEL_KEYS = {"surfaces", "turns", "motion", "motion_axis", "low", "high"}
 
 
 def shipped_models() -> tuple[ComponentModel, ...]:
-    """The component models that come with the package (`components.toml`)."""
+    """Return the component models that come with the package (`components.toml`)."""
     return load_models(Path(__file__).with_name("components.toml"))
 
 
@@ -147,7 +148,7 @@ def load_models(path: Path) -> tuple[ComponentModel, ...]:
 
 
 def models_from(document: Mapping[str, Any], *, where: str = "models") -> tuple[ComponentModel, ...]:
-    """The component models of a parsed TOML document; see `load_models`."""
+    """Return the component models of a parsed TOML document; `where` names it in errors (see `load_models`)."""
     tables = document.get("model")
     if not isinstance(tables, dict) or not tables:
         raise ConfigError(f"{where}: no [model.NAME] tables", hint="one table a component")
@@ -155,6 +156,7 @@ def models_from(document: Mapping[str, Any], *, where: str = "models") -> tuple[
 
 
 def _model(name: str, table: Mapping[str, Any], *, where: str) -> ComponentModel:
+    """Check the table of a model and build the model."""
     _only(table, MODEL_KEYS, where)
     rows = table.get("surfaces")
     if not isinstance(rows, list) or not rows:
@@ -180,6 +182,7 @@ def _model(name: str, table: Mapping[str, Any], *, where: str) -> ComponentModel
 
 
 def _turns(table: Mapping[str, Any], where: str) -> int:
+    """Return the checked order of the rotational symmetry."""
     turns = table.get("turns", 1)
     if isinstance(turns, bool) or not isinstance(turns, int) or turns < 0:
         raise ConfigError(f"{where}.turns is {turns!r}", hint="how many turns look the same: 1, 2, ..., 0 = all")
@@ -187,6 +190,7 @@ def _turns(table: Mapping[str, Any], where: str) -> int:
 
 
 def _surface(row: Mapping[str, Any], *, where: str) -> ModelSurface:
+    """Check the table of a surface and build the surface."""
     _only(row, SURFACE_KEYS, where)
     kind = row.get("type")
     if kind not in set(Form):
@@ -226,12 +230,14 @@ def _along(row: Mapping[str, Any], normal: Array, where: str) -> Array:
 
 
 def _only(table: Mapping[str, Any], known: set[str], where: str) -> None:
+    """Raise ConfigError if the table has a key that is not `known`."""
     unknown = sorted(set(table) - known)
     if unknown:
         raise ConfigError(f"{where}: unknown key {unknown[0]!r}", hint=f"known keys: {sorted(known)}")
 
 
 def _number(table: Mapping[str, Any], key: str, default: float, where: str) -> float:
+    """Return a finite number of the table, or the default."""
     value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ConfigError(f"{where}.{key} is {value!r}", hint="give a finite number")
@@ -239,6 +245,7 @@ def _number(table: Mapping[str, Any], key: str, default: float, where: str) -> f
 
 
 def _vector(table: Mapping[str, Any], key: str, default: Sequence[float], where: str) -> Array:
+    """Return three numbers of the table as an array (3,), or the default."""
     value = table.get(key, default)
     if not isinstance(value, list | tuple) or len(value) != 3 or not all(isinstance(v, int | float) for v in value):
         raise ConfigError(f"{where}.{key} is {value!r}", hint="give three numbers")
@@ -246,6 +253,7 @@ def _vector(table: Mapping[str, Any], key: str, default: Sequence[float], where:
 
 
 def _pair(table: Mapping[str, Any], key: str, where: str) -> tuple[float, float]:
+    """Return two numbers of the table."""
     value = table[key]
     if not isinstance(value, list | tuple) or len(value) != 2 or not all(isinstance(v, int | float) for v in value):
         raise ConfigError(f"{where}.{key} is {value!r}", hint="give two numbers")
@@ -253,6 +261,7 @@ def _pair(table: Mapping[str, Any], key: str, where: str) -> tuple[float, float]
 
 
 def _unit(vector: Array, where: str) -> Array:
+    """Return the vector (3,) with length one."""
     length = float(np.linalg.norm(vector))
     if length < 1e-9:
         raise ConfigError(f"{where}: a direction of length zero", hint="give a vector; its length does not matter")

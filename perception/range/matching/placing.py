@@ -17,10 +17,10 @@ from perception.range.matching.verify import View
 from perception.range.primitives import Surface
 
 FREE_TURN_RAD = np.pi / np.sqrt(3.0)  # standard deviation of an unknown angle: uniform over a full turn
-DROP = 2.0
-SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of a fine step
+DROP = 2.0  # of the log-likelihood at two standard deviations
+SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # tested shifts, relative to a fine step
 GROWTH_LEVELS = 2
-LEAST_PITCHES = 0.1  # pixels; lower bound of the standard deviation of a position, because outlines are no sharper
+LEAST_PITCHES = 0.1  # least standard deviation of a position in pixels, because outlines are no sharper
 
 
 def placed_covariance(t: Try, view: View, base: Surface) -> tuple[Array, float]:
@@ -53,7 +53,7 @@ def placed_covariance(t: Try, view: View, base: Surface) -> tuple[Array, float]:
 
 
 def _deviation(t: Try, way: Array, view: View) -> float:
-    """Return the standard deviation along `way`, in units of its length; the larger of both directions."""
+    """Return the standard deviation along `way`, in units of its length: the larger of those in both directions."""
     growths = growths_of(t.candidate, t.q.size)
     out = 0.0
     for sign in (1.0, -1.0):

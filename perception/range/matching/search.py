@@ -16,13 +16,13 @@ STARTS = 24  # hypotheses refined per model, plus a quarter of the number of pie
 SMALL_STARTS = 120  # for a model of few pixels, which is cheap to try and easily outranked by poses behind occluders
 FINE_STARTS = 6  # plus an eighth of the number of pieces
 WORST_START = -45.0  # a lower score is dropped; adapting the sizes can gain about this much
-APART_M, APART_RAD = 0.008, 0.1
-SAME_PLACE_M = 0.005
-COARSE_M, COARSE_RAD, COARSE_LEVELS = 0.006, 0.12, 3
-FINE_M, FINE_RAD, FINE_LEVELS = 0.0012, 0.03, 4
-GROWTH_STEP = 0.4  # of the tolerance
+APART_M, APART_RAD = 0.008, 0.1  # two hypotheses with smaller differences count as one
+SAME_PLACE_M = 0.005  # the same after coarse refinement, whatever the rotation
+COARSE_M, COARSE_RAD, COARSE_LEVELS = 0.006, 0.12, 3  # first steps of the coarse search; how often they are halved
+FINE_M, FINE_RAD, FINE_LEVELS = 0.0012, 0.03, 4  # the same for the fine search
+GROWTH_STEP = 0.4  # first step of a surface's size, relative to its tolerance
 GROWING_FROM_M = 0.0015  # sizes with a smaller tolerance are not adapted, because the data cannot resolve them
-UPRIGHT = 0.5
+UPRIGHT = 0.5  # a motion axis with a larger z component is perpendicular to the panel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

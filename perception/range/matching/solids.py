@@ -1,17 +1,18 @@
 """Ray casting of component models: bounded primitives in the object's frame (compiled).
 
-A solid is a table with one row per surface. Its columns:
+A solid is a table with one row per surface. Its columns are:
 
     0       form: DISC, RECTANGLE, CYLINDER, CONE, SPHERE, ELLIPSOID or TORUS
     1-3     reference point: centre of a face, cylinder, sphere or torus, or the apex of a cone
-    4-6     unit axis or normal          7-9     unit direction of a rectangle's first side
+    4-6     unit axis or normal
+    7-9     unit direction of a rectangle's first side
     10, 11  radius and half length (cylinder), half sides (rectangle), tangent of the half angle (cone),
-            radius (disc, sphere), radius of the ring and of its tube (torus)
+            radius (disc, sphere), radius of the centre line and of the tube (torus)
     10-12   radii along the object's axes (ellipsoid)
     13, 14  least and greatest z of the part of a sphere or cone that exists
     15      1 if the surface belongs to the sliding part
 
-Only the nearest hit along a ray counts, so that one surface of a solid can hide another.
+Only the nearest hit along a ray counts, so one surface of a solid can hide another.
 """
 
 # ruff: noqa: PLR0912 - compiled loops take plain arrays, and one branch per form is clearest.
@@ -26,10 +27,10 @@ from perception.range.matching.models import ComponentModel, Form, ModelSurface,
 DISC, RECTANGLE, CYLINDER, CONE, SPHERE, ELLIPSOID, TORUS = range(7)
 WIDTH = 16
 MOVES = 15
-TRACE_STEPS = 24
-TRACE_END_M = 1e-5
+TRACE_STEPS = 24  # most steps of `_ring` along a ray
+TRACE_END_M = 1e-5  # distance from the torus at which the tracing ends
 FREE_LENGTH = 4.0  # half length, in radii, of a cylinder whose length the model does not give
-MARGIN_PX = as_numpy_scalar(1)
+MARGIN_PX = as_numpy_scalar(1)  # around the bounding box of a surface
 
 
 def solid_of(model: ComponentModel) -> Array:
@@ -55,7 +56,7 @@ def boxes_of(model: ComponentModel, *, with_travel: bool = False) -> Array:
 
 
 def _shifts(model: ComponentModel, surface: ModelSurface) -> list[Array]:
-    """Displacements (3,) of a surface at both ends of its travel; a single zero if it does not slide."""
+    """Return the displacements (3,) of a surface at both ends of its travel; a single zero if it does not slide."""
     if model.motion != MotionKind.SLIDE or not surface.moves:
         return [np.zeros(3)]
     return [model.motion_axis * model.low, model.motion_axis * model.high]
@@ -105,7 +106,10 @@ def _row(s: ModelSurface) -> Array:
 
 @compiled
 def hit(row: Array, grow: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
-    """Return the smallest t at which the ray o + t d hits the surface enlarged by `grow` metres; infinite on a miss."""
+    """Return the smallest t at which the ray o + t d hits a surface, given by its row and enlarged by `grow` metres.
+
+    Infinite if the ray misses.
+    """
     form = int(row[0])
     wx, wy, wz = ox - row[1], oy - row[2], oz - row[3]
     ax, ay, az = row[4], row[5], row[6]
@@ -167,7 +171,11 @@ def _ring(
     R: float, r: float, ax: float, ay: float, az: float, wx: float, wy: float, wz: float, dx: float, dy: float,
     dz: float,
 ) -> float:  # fmt: skip
-    """Intersect a ray with a torus by sphere tracing (Hart, The Visual Computer 12, 1996); infinite on a miss."""
+    """Intersect a ray with a torus by sphere tracing (Hart, The Visual Computer 12, 1996); infinite on a miss.
+
+    R, r: radii of the centre line and of the tube; a: unit axis; w, d: origin relative to the centre, and direction, of
+    the ray.
+    """
     A, B = dx * dx + dy * dy + dz * dz, dx * wx + dy * wy + dz * wz
     disc = B * B - A * (wx * wx + wy * wy + wz * wz - (R + r) * (R + r))
     if disc < 0.0:
@@ -199,7 +207,11 @@ def _ring(
 def window_of(
     box: Array, shift: Array, R: Array, p: Array, sen: Array, margin: int, limit: Indices, window: Indices,
 ) -> None:  # fmt: skip
-    """Fill `window` (u0, v0, u1, v1) with the pixels covered by a box (2, 3) of the object's frame, clipped to `limit`."""
+    """Fill `window` (u0, v0, u1, v1) with the pixels that a box (2, 3) of the object's frame covers.
+
+    R, p: sensor_from_object. `shift` (3,) displaces the box, `margin` pixels are added on each side, and the window is
+    clipped to `limit`.
+    """
     u0, v0, u1, v1 = 1e9, 1e9, -1e9, -1e9
     for corner in range(8):
         x = box[corner & 1, 0] + shift[0]

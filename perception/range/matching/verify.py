@@ -3,8 +3,8 @@
 A pixel that the model covers is explained (measured and rendered depth agree), hidden (the measured depth is nearer) or
 contradicted (the sensor sees through the model). Its gain is the log-likelihood under the model, with a lower bound for
 gross errors, minus the log-likelihood under the bare panel. Hidden pixels cost little, because anything may stand in
-front. Beyond the outline, depth that continues smoothly from an explained pixel also contradicts, because the object is
-then larger than the model.
+front. Beyond the outline, depth that continues smoothly from an explained pixel also contradicts the model, because the
+object is then larger than the model.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from hal.jit import compiled
 from perception.range.matching.solids import MOVES, render, window_of
 
 HIT = 3.0  # log-likelihood of a pixel that agrees, relative to a gross error
-HIDDEN = -0.4
+HIDDEN = -0.4  # log-likelihood of a pixel whose depth is in front of the model
 MIXED = -0.4  # at a depth jump half of the beams measure some depth between its sides, so this costs little
-SEEN_THROUGH = -3.0
-GOES_ON = -2.0
-RING_PX = 2
+SEEN_THROUGH = -3.0  # log-likelihood of a pixel whose depth is behind the model
+GOES_ON = -2.0  # log-likelihood of a pixel beyond the outline whose depth continues smoothly
+RING_PX = 2  # distance from the outline at which that is tested
 SLACK_M = 0.0002  # deviation of real components from their models, apart from sizes and heights
-SLOPE_SHARE = 0.3  # of the depth step to the next pixel: the accuracy of an outline's position
-STEEPEST_M = 0.004
-TRIES = 4
-HITS, BEHIND, RING, FRONT, COVERED, BETWEEN = range(6)
+SLOPE_SHARE = 0.3  # standard deviation of an outline's position in pixels
+STEEPEST_M = 0.004  # largest depth step to the next pixel that is allowed for in this way
+TRIES = 4  # most rounds of the coordinate search per step size
+HITS, BEHIND, RING, FRONT, COVERED, BETWEEN = range(6)  # indices of the `counts` of `judged`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,7 +78,10 @@ def _placed(
     boxes: Array, slide: Array, q: Array, R0: Array, p0: Array, sen: Array, limit: Indices, R: Array, p: Array,
     window: Indices,
 ) -> None:  # fmt: skip
-    """Write the pose of the hypothesis into `R`, `p`, and the pixels that the solid covers, with a margin, into `window`."""
+    """Write the pose of the hypothesis q into `R`, `p`, and the pixels that the solid covers into `window`.
+
+    R0, p0: sensor_from_panel. R, p: sensor_from_object. The window has a margin for pixels beyond the outline.
+    """
     c, s = np.cos(q[2]), np.sin(q[2])
     for a in range(3):
         R[a, 0] = c * R0[a, 0] + s * R0[a, 1]
@@ -98,7 +101,11 @@ def _lifts(
     m: Array, k: Indices, window: Indices, stride: int, h: int, w: int, z: Array, sigma: Array, tolerance: Array,
     is_free: Mask, lift: Array,
 ) -> None:  # fmt: skip
-    """Estimate how much deeper each row of this component lies than in its model, within its tolerance, into `lift` (S,)."""
+    """Estimate into `lift` (S,) how much deeper each row of this component lies than in its model.
+
+    m, k: rendered depth and row number of the pixels of `window`; `is_free` (S,): rows whose height may differ, by up
+    to their tolerance.
+    """
     S = lift.shape[0]
     weight, total = np.zeros(S), np.zeros(S)
     for j in range(h):
@@ -195,7 +202,10 @@ def _priors(q: Array, tolerance: Array, is_free: Mask, lift: Array) -> float:
 
 @compiled
 def _slope(m: Array, k: Indices, j: int, i: int, h: int, w: int) -> float:
-    """Return the larger of the horizontal and vertical depth steps to a neighbouring pixel of the same row of the solid."""
+    """Return the larger of the horizontal and vertical depth steps to a neighbour in the same row of the solid.
+
+    m, k: rendered depth and row number; (j, i): the pixel.
+    """
     out = 0.0
     if i > 0 and k[j, i - 1] == k[j, i]:
         out = abs(m[j, i] - m[j, i - 1])
@@ -210,7 +220,10 @@ def _slope(m: Array, k: Indices, j: int, i: int, h: int, w: int) -> float:
 
 @compiled
 def _deepest_beside(m: Array, k: Indices, j: int, i: int, h: int, w: int, panel: float) -> float:
-    """Return the greatest rendered depth in the 3x3 pixels around one: a beam there may mix it with its own depth."""
+    """Return the greatest rendered depth in the 3x3 pixels around one; where the solid is absent, that is `panel`.
+
+    At a depth jump a beam may mix this depth with that of the pixel.
+    """
     out = m[j, i]
     for b in range(max(j - 1, 0), min(j + 2, h)):
         for a in range(max(i - 1, 0), min(i + 2, w)):

@@ -1,7 +1,7 @@
-"""Reading the simulated panel with cables before it, from straight ahead and with looks from the sides.
+"""Reads the simulated panel with cables in front of it, from straight ahead and with views from the sides.
 
-`python -m benchmarks.behind_cables [FIRST [COUNT]]`: two cables a cell, drawn by its seed; every object is looked at close, and
-what cannot be read from the sides too. Judged by the simulator's truth.
+`python -m benchmarks.behind_cables [FIRST [COUNT]]`: each cell has two random cables drawn from its seed. Every object
+is viewed from close by, and those that cannot be read also from the sides. Results are judged by the simulator's truth.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ ANSWERS = ("right", "wrong", "refused")
 
 
 def with_cables(cell: Cell, *cables: CableSection) -> Cell:
-    """The same cell with cables before its panel."""
+    """Return the same cell with cables in front of its panel."""
     return cell.model_copy(
         update={"file": cell.file.model_copy(update={"simulation": SimulationSection(cables=cables)})}
     )
 
 
 def drawn_cable(random: np.random.Generator, panel_half_m: tuple[float, float]) -> CableSection:
-    """A cable from border to border with one bend, thin or thick, dark or bright, 28 to 60 mm before the plate."""
+    """Draw a cable from border to border with one bend, random radius and gray, 28 to 60 mm in front of the plate."""
     w, h = panel_half_m
     across = random.uniform(-0.85, 0.85, 3)
     along = [-1.35, float(random.uniform(-0.6, 0.6)), 1.35]
@@ -63,7 +63,7 @@ def drawn_cable(random: np.random.Generator, panel_half_m: tuple[float, float]) 
 
 @contextmanager
 def open_session(cell: Cell, folder: Path) -> Iterator[Session]:
-    """An inline cell with a task of its own, before its located panel.
+    """Yield a session of a cell that runs in this process, after its panel has been located.
 
     Raises:
         CellError: the panel was not found.
@@ -86,7 +86,7 @@ def open_session(cell: Cell, folder: Path) -> Iterator[Session]:
 
 
 def verdict(reading: ObjectReading, spec: PanelObject, truth: ObjectTruth) -> str:
-    """`right`, `wrong` or `refused`."""
+    """Return `right`, `wrong` or `refused`."""
     if not reading.answered:
         return "refused"
     is_right = spec.is_right(Shown(value=reading.value, state=reading.state, text=reading.text), shown_of(truth))
@@ -94,7 +94,7 @@ def verdict(reading: ObjectReading, spec: PanelObject, truth: ObjectTruth) -> st
 
 
 def judge_cell(seed: int, folder: Path) -> tuple[Counter[str], Counter[str], list[str]]:
-    """Verdicts from straight ahead and after the looks from the sides, and a line a wrong answer."""
+    """Return the verdicts from straight ahead, those after the views from the sides, and a line per wrong answer."""
     cell = load_cell(BENCH, seed=seed)
     random = np.random.default_rng(seed)
     half = (cell.panel.width_m / 2, cell.panel.height_m / 2)
@@ -129,7 +129,7 @@ def main(arguments: list[str]) -> int:
         for seed in range(first, first + count):
             try:
                 ahead, aside, wrong = judge_cell(seed, Path(folder) / str(seed))
-            except CellError as error:  # a cable before a border light, or one that the arm ran into
+            except CellError as error:  # a cable covers a border light, or the arm ran into one
                 print(f"{seed}: {error}")
                 continue
             straight += ahead

@@ -26,7 +26,7 @@ BENCH = Path(__file__).parents[1] / "cells" / "bench.toml"
 
 
 def main() -> None:
-    """Print one line a calibration and seed, and the medians."""
+    """Print one line per calibration and seed, and the medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12, 13])
     parser.add_argument("--what", nargs="+", choices=WHAT, default=list(WHAT))
@@ -78,7 +78,7 @@ def _one_cell(
 def _compared(
     cell: Cell, device: str, record: CalibrationRecord, *, is_load: bool
 ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
-    """(error before, error after, one sigma as stated): m and rad of a mount, or kg and N of a load."""
+    """Return (error before, error after, stated sigma), each as m and rad of a mount or as kg and N of a load."""
     draws, built = Draws(cell.file.cell.seed), cell.calibration_of(device)
     if is_load:
         assert record.load is not None and built.load is not None

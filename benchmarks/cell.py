@@ -1,7 +1,7 @@
-"""Speed and size of the whole cell: `python -m benchmarks.cell [SEED ...]`; prints figures beside pass lines.
+"""Measures speed and memory of the whole cell: `python -m benchmarks.cell [SEED ...]`; prints figures and limits.
 
-Everything runs through the real server: processes, HTTP, the mission, the stop port. Times are this machine's; the
-time ratio to the time of one plain loop of the same run says how busy it was.
+Everything runs through the real server: processes, HTTP, the mission, the stop port. Times depend on the machine; the
+time of one plain loop in the same run shows how busy the machine was.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FLOOR_LOOPS = 2_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """One figure beside its pass line; `is_met` None: nothing is demanded."""
+    """Measured figure beside its limit; `is_met` is None if there is no limit."""
 
     what: str
     measured: str
@@ -42,7 +42,7 @@ class Line:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure and print; exit code 1 when a line is missed."""
+    """Measure and print; return exit code 1 if a limit is missed."""
     seeds = [int(a) for a in arguments] or [1]
     console = Console()
     lines = [_floor(), real_time_factor()]
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def real_time_factor() -> Line:
-    """Simulated over wall seconds of the control loop with every sensor read each tick."""
+    """Measure simulated per wall-clock seconds of the control loop, with every sensor read in each tick."""
     runtime = CellRuntime.start(load_cell(ROOT / "cells/bench.toml"), is_latched=lambda: False)
     try:
         mover = runtime.objects["cell.mover"]
@@ -77,7 +77,7 @@ def real_time_factor() -> Line:
 
 
 def measure_mission(seed: int) -> list[Line]:
-    """Start-up, one mission and the stop port, through the real server."""
+    """Measure the start-up, one mission and the stop port through the real server."""
     with tempfile.TemporaryDirectory() as folder:
         cell = load_cell(ROOT / "cells/bench.toml", seed=seed)
         started_s = time.monotonic()
@@ -131,7 +131,7 @@ def _mission_lines(
 
 
 def _floor() -> Line:
-    """How fast this machine runs a plain loop right now: compare runs by it."""
+    """Measure how fast the machine runs a plain loop at this time, for comparing runs."""
     started_s = time.perf_counter()
     total = 0
     for k in range(FLOOR_LOOPS):
@@ -158,7 +158,7 @@ def run_to_end(client: Client, path: str, body: Any) -> dict[str, Any]:
 
 
 def _stops_while_rendering(client: Client, stop_url: str) -> list[float]:
-    """Seconds from POST to the answer of the stop process, while another thread asks for images without pause."""
+    """Return the seconds from POST to the answer of the stop process, while another thread requests images."""
     base, path = stop_url.rsplit("/v1/", 1)[0], "/v1/stop"
     stopper, ending = Client(url=base), threading.Event()
 

@@ -1,7 +1,8 @@
-"""Draws seven-segment displays as cameras see them: own renderings, for tests and a line of the benchmark.
+"""Draws synthetic images of seven-segment displays, for tests and for the benchmark.
 
-A face (segment shapes, ghosts, bloom, window, bezel) is painted upright and large, laid into the picture by a homography, and
-then meets light, glare, cables, lens, sensor and JPEG. Nothing in it is taken from the development images.
+A face (segment shapes, ghosts of unlit segments, bloom, window, bezel) is painted upright and large, projected into the
+image by a homography, and then degraded by uneven light, glare, cables, lens, sensor and JPEG. Nothing is taken from
+the development images.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ PHOTOGRAPHS = ("cropped", "scene", "low contrast")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DisplayCase:
-    """One drawn display and what it says.
+    """Drawn display with its true text.
 
     Attributes:
         image: (H, W) uint8.
-        text: what it shows, leading blanks left out.
+        text: the displayed text without leading blanks.
         corners_px: (4, 2) outer corners of the window (inside the bezel), clockwise from the upper left.
-        size: width and height of the window over the digit height.
+        size: width and height of the window, in units of the digit height.
         is_dark: dark segments on a bright ground (LCD).
-        digits, decimals: cells of the display and places behind its point.
-        hidden: share of the lit segments' ink that a cable covers.
+        digits, decimals: number of digits, and of decimal places.
+        hidden: fraction of the lit segments' area that cables cover.
     """
 
     image: Gray
@@ -45,7 +46,7 @@ class DisplayCase:
 
 
 def draw_taught(seed: int, level: str) -> DisplayCase:
-    """A display on a plate as the taught panel sees it: 1.2 to 3 px of image a stroke, disturbed by level."""
+    """Draw a display on a plate as in images of a taught panel: strokes of 1.2 to 3 px, degraded by `level`."""
     random = np.random.default_rng((seed, LEVELS.index(level)))
     face = random_face(random, is_dark=bool(random.random() < 0.4), thin=True)
     hard = LEVELS.index(level)
@@ -54,7 +55,7 @@ def draw_taught(seed: int, level: str) -> DisplayCase:
 
 
 def draw_photograph(seed: int, kind: str) -> DisplayCase:
-    """A photograph of an LCD or LED device: cropped to its display, with the device round it, or of very low contrast."""
+    """Draw a photograph of an LCD or LED device: cropped to its display, with the device, or of low contrast."""
     random = np.random.default_rng((seed, 7 + PHOTOGRAPHS.index(kind)))
     face = random_face(random, is_dark=bool(random.random() < 0.75), thin=False)
     high = float(np.exp(random.uniform(np.log(28), np.log(110))))
@@ -66,8 +67,8 @@ def draw_photograph(seed: int, kind: str) -> DisplayCase:
 def _pictured(
     random: np.random.Generator, face: Face, high: float, *, tilt: float, hard: int, span: tuple[int, int], photo: str = ""
 ) -> DisplayCase:  # fmt: skip
-    """The face in a picture: `high` px a digit, `span` rows of plate round it (0: cropped)."""
-    k = 2  # the picture is made twice as large as it is taken
+    """Draw the face in an image: digits `high` px tall, `span` rows of plate around it (0: cropped)."""
+    k = 2  # drawn at twice the final resolution
     ink, ghosts = face_ink(face)
     shading = face_gray(random, face, ink, ghosts, low=photo == "low contrast")
     bezel = round((0.08 if not photo else random.uniform(0.03, 0.3)) * HIGH_PX)
@@ -105,7 +106,7 @@ def _pictured(
 
 
 def _tilted(random: np.random.Generator, points: Array, tilt: float, turned_rad: float) -> Array:
-    """Points seen from aside: foreshortened and converging, and turned a little."""
+    """Return points as seen at an angle: foreshortened, with perspective, and slightly rotated."""
     turn = turned_rad + random.normal(0.0, 0.35 * tilt)
     lean = random.uniform(0, 2 * np.pi)
     n = np.array([np.cos(lean), np.sin(lean)])

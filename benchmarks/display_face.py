@@ -1,4 +1,4 @@
-"""The face of a drawn seven-segment display: segment shapes, slant, ghosts, bloom, and small words beside the digits."""
+"""Faces of drawn seven-segment displays: segment shapes, slant, ghosts, bloom, and small words beside the digits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hal.arrays import Array
 
 Float32 = NDArray[np.float32]
 
-HIGH_PX = 96  # of a digit on the painted face
+HIGH_PX = 96  # height of a digit on the painted face
 LIT = {
     "0": "abcdef", "1": "bc", "2": "abged", "3": "abgcd", "4": "fgbc", "5": "afgcd", "6": "afgedc", "7": "abc",
     "8": "abcdefg", "9": "abcdfg", "-": "g", " ": "",
@@ -23,10 +23,10 @@ WORDS = ("AUTO", "HOLD", "MAX", "SET", "kPa", "mA", "V", "Hz", "bar", "%", "LOW 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Face:
-    """How a display is built; lengths over the digit height.
+    """Design of a display; lengths are in units of the digit height.
 
-    `other_forms` are digits drawn the other way (6 and 9 without their tail, 7 with one); `words` are small ones in the
-    window: text, left, foot, height of its letters.
+    `other_forms` are digits in their alternative form (6 and 9 without tail, 7 with one); `words` are small words in
+    the window, each with its text, left end, baseline and letter height.
     """
 
     text: str
@@ -47,7 +47,7 @@ class Face:
 
 
 def random_face(random: np.random.Generator, *, is_dark: bool, thin: bool) -> Face:
-    """A face with its number; `thin` as panel displays are, else as bought devices look."""
+    """Draw a random face with a number; with thin segments like panel displays, or else like commercial devices."""
     digits = int(random.integers(3, 7 if thin else 6))
     decimals = int(random.integers(0, min(4, digits)))
     least = 0 if not decimals else 10**decimals // 2
@@ -68,7 +68,7 @@ def random_face(random: np.random.Generator, *, is_dark: bool, thin: bool) -> Fa
 
 
 def _as_bought(random: np.random.Generator, face: Face) -> Face:
-    """The face with what devices add: rounded segments, other forms of digits, small words above or beside the digits."""
+    """Return the face with features of commercial devices: rounded segments, alternative digits, small words."""
     other_forms = "".join(d for d in OTHER_FORMS if random.random() < 0.15)
     shape = "round" if random.random() < 0.2 else face.shape
     if random.random() < 0.6:
@@ -88,7 +88,7 @@ def _as_bought(random: np.random.Generator, face: Face) -> Face:
 
 
 def face_ink(face: Face) -> tuple[Float32, Float32]:
-    """(ink, ghosts) of a face, both (H, W) from 0 to 1: what is lit, and where every unlit segment is."""
+    """Return (ink, ghosts) of a face, both (H, W) from 0 to 1: the lit segments, and the unlit ones."""
     h = HIGH_PX
     width = (face.digits - 1) * face.cell * face.pitch + face.cell + 2 * face.room[0]
     size = (round((1 + 2 * face.room[1]) * h), round(width * h))
@@ -113,14 +113,14 @@ def face_ink(face: Face) -> tuple[Float32, Float32]:
 
 
 def write(canvas: Float32, words: str, foot_px: tuple[int, int], scale: float, gray: float, thickness_px: int) -> None:
-    """Writes on a picture of floats, (H, W): OpenCV 5 puts text on bytes only, so it makes a stencil."""
+    """Write text into an (H, W) float image by way of a mask, because OpenCV 5 writes text into 8-bit images only."""
     stencil = np.zeros(canvas.shape, np.uint8)
     cv2.putText(stencil, words, foot_px, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness_px, cv2.LINE_8)
     canvas[stencil > 0] = gray
 
 
 def _segment(face: Face, name: str) -> Array:
-    """(N, 2) outline of a segment in digit heights, from the cell's upper left corner."""
+    """Return the (N, 2) outline of a segment, in digit heights from the upper left corner of the digit."""
     t = face.stroke / 2
     x0, x1, y0, ym, y1 = t, face.cell - t, t, 0.5, 1 - t
     (ax, ay), (bx, by) = {
@@ -150,7 +150,7 @@ def _segment(face: Face, name: str) -> Array:
 
 
 def face_gray(random: np.random.Generator, face: Face, ink: Float32, ghosts: Float32, *, low: bool) -> Float32:
-    """(H, W) gray levels of the face: glowing with bloom or dark with a cast shadow; `low`: of very low contrast."""
+    """Return (H, W) gray levels of the face: bright with bloom, or dark with a cast shadow; `low`: at low contrast."""
     if not face.is_dark:
         back, light = random.uniform(8, 40), random.uniform(110, 230)
         if low:

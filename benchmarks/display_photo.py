@@ -1,4 +1,4 @@
-"""What a camera makes of a drawn display: its surroundings, uneven light, glare, cables, lens, sensor and file."""
+"""Turns a drawn display into a photograph: surroundings, uneven light, glare, cables, lens, sensor and file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Gray = NDArray[np.uint8]
 
 
 def surroundings(random: np.random.Generator, shape: tuple[int, int], photo: str, target: Array) -> Float32:
-    """Plate or device round the display: a flat gray, in scenes with a case, keys and words."""
+    """Draw the plate or the device around the display: uniform gray, or a scene with a case, keys and words."""
     picture = np.full(shape, random.uniform(60, 200), np.float32)
     if photo != "scene":
         return picture
@@ -37,7 +37,7 @@ def surroundings(random: np.random.Generator, shape: tuple[int, int], photo: str
 def disturbed(
     random: np.random.Generator, picture: Float32, lit: Float32, high: float, hard: int, photo: str, target: Array
 ) -> tuple[Float32, float]:  # fmt: skip
-    """Uneven light, glare and cables; and the share of the lit ink that these cables cover."""
+    """Add uneven light, glare and cables; return the image and the fraction of the lit area that cables cover."""
     height, width = picture.shape
     v, u = np.mgrid[:height, :width].astype(np.float32)
     lean, ratio = random.uniform(0, 2 * np.pi), (1.2, 1.7, 2.4)[hard]
@@ -49,7 +49,7 @@ def disturbed(
         x, y = middle + random.uniform(-1.3, 1.3, 2) * half
         r = random.uniform(0.5, 1.6) * high
         out = out + random.uniform(0.3, 1.0) * strength * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * r * r))
-    if photo and random.random() < 0.3:  # a window mirrored in the glass: straight, sharp edges
+    if photo and random.random() < 0.3:  # reflection of a window in the glass, with straight, sharp edges
         x, y = middle + random.uniform(-1.0, 1.0, 2) * half
         side = random.uniform(0.4, 1.5, 2) * high
         quad = np.array([[x, y], [x + side[0], y + 3], [x + side[0] + 5, y + side[1]], [x + 4, y + side[1]]])
@@ -71,7 +71,7 @@ def disturbed(
 
 
 def taken(random: np.random.Generator, picture: Float32, high: float, hard: int, photo: str) -> Gray:
-    """The picture through exposure, lens, sensor and file."""
+    """Return the image after exposure, lens, sensor and file compression."""
     exposure = random.uniform(*((0.9, 1.1), (0.7, 1.25), (0.4, 1.4))[hard])
     stroke = 0.11 * high
     blur = random.uniform(0.3, (0.3, 0.45, 0.5)[hard] * stroke + 0.35)

@@ -1,7 +1,7 @@
-"""Seven-segment displays on own renderings: `python -m benchmarks.display_report [CASES]`; also part of `benchmarks.vision`.
+"""Reads drawn seven-segment displays: `python -m benchmarks.display_report [CASES]`; also part of `benchmarks.vision`.
 
-Photographs of displays cannot be given out: the lines on photographs are measured on drawings made to look like them, which
-is no promise for real ones. The readers were tuned on seeds from 1000 on; these are the seeds from 0.
+Photographs of displays may not be published, so the lines on photographs are measured on drawings that imitate them;
+real photographs may give other results. The readers were tuned on seeds from 1000 on; this benchmark uses seeds from 0.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PASS = {"cropped": 0.70, "scene": 0.50, "low contrast": 0.30}
 
 
 def read_case(case: DisplayCase, *, known: bool) -> PatchReading:
-    """The reading of a drawn display through a plane view that knows its place; `known`: digits and decimals are taught."""
+    """Read a drawn display at its known place; `known`: the numbers of digits and decimals are taught."""
     w, h = 0.02 * case.size[0], 0.02 * case.size[1]
     plate = np.array([[-w / 2, h / 2], [w / 2, h / 2], [w / 2, -h / 2], [-w / 2, -h / 2]])
     view = PlateProjection(px_from_plate=homography(plate, case.corners_px), corners_m=plate)
@@ -37,7 +37,7 @@ def read_case(case: DisplayCase, *, known: bool) -> PatchReading:
 
 
 def display_lines(count: int = CASES) -> None:
-    """Print the share read exactly, and the share of sure answers that are wrong, for every sort of own rendering."""
+    """Print the fractions read exactly and of confident answers that are wrong, for every kind of drawing."""
     print("\ndisplays on OWN RENDERINGS (no photographs of displays can be given out): exact / sure (> 0.8) and wrong")
     for known in (True, False):
         for level in LEVELS:

@@ -1,1 +1,1 @@
-"""Drivers on bad and good wires, measured: `python -m benchmarks.drivers`; one module a subject."""
+"""Benchmarks of drivers on faulty and on good links: `python -m benchmarks.drivers`; one module per subject."""

@@ -34,7 +34,7 @@ PARTS: dict[str, Callable[[float], None]] = {
 
 
 def main() -> None:
-    """Run the parts that were asked for."""
+    """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="for each cell and figure")
     parser.add_argument("--only", default=",".join(PARTS), help="comma list of parts")

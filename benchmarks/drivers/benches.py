@@ -1,4 +1,4 @@
-"""Every driver with a far side: how it is started, with which options, and how its values are judged."""
+"""Test setups of all drivers with emulators: how they are started, their options, and how values are checked."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from hal.registry import Context, connect
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bench:
-    """One device to try: far side, driver, options, and whether a value is one of the last true ones."""
+    """Test setup of one device: emulator, driver, options, and a check that a value is one of the latest true ones."""
 
     name: str
     start: Callable[[Any, dict[str, Any]], WireEmulator]
@@ -57,7 +57,7 @@ class Bench:
     far_options: dict[str, Any] = field(default_factory=dict)
     faults: tuple[WireFault, ...] = tuple(WireFault)
     taken_s: Callable[[Any, Any], float] | None = None
-    """When a value was taken (monotonic), where the value tells and the protocol lets a driver know."""
+    """Returns when a value was taken (monotonic clock); None if the value or the protocol does not reveal it."""
 
 
 WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
@@ -210,7 +210,7 @@ BENCHES = (
 
 @contextmanager
 def running(bench: Bench, far_options: dict[str, Any]) -> Iterator[tuple[Any, Any, Any]]:
-    """Driver, far side and the device behind it."""
+    """Yield the driver, the emulator and its backing device."""
     backing = bench.backing()
     far_side = bench.start(backing, {**bench.far_options, **far_options})
     device = None
@@ -224,5 +224,5 @@ def running(bench: Bench, far_options: dict[str, Any]) -> Iterator[tuple[Any, An
 
 
 def bench(name: str) -> Bench:
-    """The bench of that name."""
+    """Return the test setup called `name`."""
     return next(item for item in BENCHES if item.name == name)

@@ -1,7 +1,8 @@
-"""Far sides in a process of their own, so that their work does not count as the drivers'.
+"""Runs emulators in a process of their own, so that their work is not measured as the drivers'.
 
-`python -m benchmarks.drivers.far_process NAME[?KEY=VALUE]..` prints a line of addresses; then each line on its input is an order:
-`inject silent|disconnected|none`, `log NAME` (prints when its frames left), `count NAME COUNTER`, `end`.
+`python -m benchmarks.drivers.far_process NAME[?KEY=VALUE]..` prints a line of addresses. Then each line of its input is
+a command: `inject silent|disconnected|none`, `log NAME` (prints when its frames were sent), `count NAME COUNTER`,
+`end`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from hal.simulated import Fault
 
 
 class FarProcess:
-    """The orders to the process, from here."""
+    """Controls the process of the emulators."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         command = [sys.executable, "-m", "benchmarks.drivers.far_process", *names]
@@ -32,25 +33,25 @@ class FarProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Return the process id."""
         return self._process.pid
 
     def order(self, text: str) -> Any:
-        """Give one order and wait for its answer."""
+        """Send one command and wait for its answer."""
         assert self._process.stdin is not None
         self._process.stdin.write(text + "\n")
         self._process.stdin.flush()
         return self._answer()
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self.order("end")
         self._process.wait(10.0)
 
 
 @contextmanager
 def far_process(*names: str) -> Iterator[FarProcess]:
-    """The far sides of these benches, running elsewhere."""
+    """Run the emulators of these test setups in another process."""
     far = FarProcess(names)
     try:
         yield far
@@ -59,16 +60,16 @@ def far_process(*names: str) -> Iterator[FarProcess]:
 
 
 def start(text: str) -> tuple[str, Any]:
-    """The name and the far side of `NAME` or, with an option of its emulator, `NAME?KEY=VALUE`."""
+    """Start the emulator of `NAME` or, with an option, `NAME?KEY=VALUE`; return its name and the emulator."""
     name, _, option = text.partition("?")
     item, (key, _, value) = bench(name), option.partition("=")
     return name, item.start(item.backing(), {**item.far_options, **({key: value} if key else {})})
 
 
 def main() -> None:
-    """Run the far sides named on the command line."""
+    """Run the emulators named on the command line."""
     sides = dict(map(start, sys.argv[1:]))
-    freeze_loaded()  # as in a cell process: a full collection would silence all devices for 50 ms
+    freeze_loaded()  # as in a cell process: a full garbage collection would silence all devices for 50 ms
     print(json.dumps({name: side.address for name, side in sides.items()}), flush=True)
     for text in sys.stdin:
         what, _, rest = text.strip().partition(" ")

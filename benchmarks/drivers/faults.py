@@ -1,4 +1,4 @@
-"""The fault matrix: device x fault x every 3rd and 20th frame, many cells at the same time, since most only wait."""
+"""Fault matrix: device x fault x every 3rd and 20th frame; many cells run at the same time, as they mostly wait."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from drivers.emulators.faults import WireFault
 from hal.errors import CellError
 from hal.readings import Quality, Stamped
 
-MIXED = "mixed"  # another of the device's faults each time
+MIXED = "mixed"  # a random one of the device's faults each time
 SLACK_S = 0.05
 BEAT_S = 0.005
-STALL_S = 0.001  # the probe woke so much too late: this process did not run, and no driver could have answered
+STALL_S = 0.001  # if the probe wakes later than this, the process was not running and no driver could answer
 REST_S = 0.005
 PROCESSES = 2
-AT_ONCE = 7  # cells a process
+AT_ONCE = 7  # cells per process
 
 
 @dataclass(slots=True)
 class Cell:
-    """Counts of one cell of the matrix; `stalled` are late calls during which the machine did not run this process."""
+    """Counts of one cell of the matrix; `stalled` are late calls during which the process was not running."""
 
     good: int = 0
     errors: int = 0
@@ -38,13 +38,13 @@ class Cell:
     untyped: int = 0
 
     def add(self, other: Cell) -> None:
-        """Sum up."""
+        """Add the counts of another cell."""
         for field in fields(Cell):
             setattr(self, field.name, getattr(self, field.name) + getattr(other, field.name))
 
 
 class StallProbe:
-    """A thread that does nothing but wake: where it is late, so is everybody. A driver that blocks does not delay it."""
+    """Thread that only sleeps and wakes; if it is late, the process stood still, as no blocking driver can delay it."""
 
     def __init__(self) -> None:
         self._stalls: list[tuple[float, float]] = []
@@ -64,7 +64,7 @@ class StallProbe:
                 self._beaten.notify_all()
 
     def stalled_s(self, start_s: float, end_s: float) -> float:
-        """How much of that time this process stood still; asks once the probe, too, has come so far."""
+        """Return how long this process stood still in the interval; waits until the probe has reached its end."""
         with self._beaten:
             self._beaten.wait_for(lambda: self._beat_s >= end_s, timeout=1.0)
             return sum(max(0.0, min(end_s, b) - max(start_s, a)) for a, b in self._stalls)
@@ -76,7 +76,7 @@ class StallProbe:
 
 
 def part_faults(seconds: float) -> None:
-    """Every cell, then one line a device and frequency, and the cells without any good sample by name."""
+    """Run all cells; print one line per device and fault rate, and each cell with defects or without a good sample."""
     keys = [(item.name, fault, every) for item in BENCHES for every in (3, 20) for fault in (*item.faults, MIXED)]
     order = sorted(keys, key=lambda key: (key[1], key[2], key[0]))  # a batch mixes light and heavy devices
     batches = [order[i : i + AT_ONCE] for i in range(0, len(order), AT_ONCE)]
@@ -106,7 +106,7 @@ def _row(item: Bench, every: int, cells: dict[str, Cell]) -> None:
 
 
 def run_batch(batch: list[tuple[str, str, int]], seconds: float) -> list[Cell]:
-    """Some cells at the same time (in a worker process)."""
+    """Run some cells at the same time, in a worker process."""
     sys.setswitchinterval(0.001)
     probe = StallProbe()
     with ThreadPoolExecutor(len(batch)) as pool:
@@ -116,9 +116,9 @@ def run_batch(batch: list[tuple[str, str, int]], seconds: float) -> list[Cell]:
 
 
 def fault_cell(item: Bench, fault: str, every: int, seconds: float, probe: StallProbe) -> Cell:
-    """Read over a bad wire for some time; a device that could not be connected is tried again."""
+    """Read over a faulty link for some time; a device that cannot be connected is tried again."""
     cell = Cell()
-    mixed = [str(kind) for kind in item.faults if kind is not WireFault.ECHO]  # an echo is on the line or is not
+    mixed = [str(kind) for kind in item.faults if kind is not WireFault.ECHO]  # a line always echoes or never does
     what = {"mixed": mixed} if fault == MIXED else {"fault": str(fault)}
     options = {**what, "every": every, "seed": every, "delay_s": 0.15, "silent_s": 0.15, "away_s": 0.05}
     rest, end_s = threading.Event(), time.monotonic() + seconds
@@ -130,12 +130,12 @@ def fault_cell(item: Bench, fault: str, every: int, seconds: float, probe: Stall
                     reader.read()
                     rest.wait(REST_S)
         except CellError:
-            cell.errors += 1  # it could not be connected, and said so
+            cell.errors += 1  # the device reported that it could not be connected
     return cell
 
 
 class Reader:
-    """Reads one device and judges what comes."""
+    """Reads one device and checks its values."""
 
     def __init__(self, item: Bench, device: Any, backing: Any, cell: Cell, probe: StallProbe) -> None:
         self._item = item
@@ -146,7 +146,7 @@ class Reader:
         self._last: Stamped[Any] | None = None
 
     def read(self) -> None:
-        """One call; a value is judged once, its age every time."""
+        """Read once; a new value is checked once, its age every time."""
         started_s = time.monotonic()
         sample: Stamped[Any] | None = None
         try:
@@ -173,7 +173,7 @@ class Reader:
         self._cell.stale += is_old
 
     def _is_ours(self, start_s: float, end_s: float, over_s: float) -> bool:
-        """Is a lateness our own? The machine's, when this process stood still for so much of that time, is counted apart."""
+        """Return whether the driver itself is late; if the process stood still as long, a stall is counted instead."""
         if over_s <= 0.0:
             return False
         is_stall = self._probe.stalled_s(start_s, end_s) >= over_s

@@ -1,4 +1,4 @@
-"""Random bytes with true frames and headers in them through every parser, in any chunks."""
+"""Feeds random bytes with valid frames and headers among them to every parser, in chunks of random length."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _accepts(frame: bytes) -> bool:
 
 
 def parsers() -> dict[str, tuple[Feed, bytes]]:
-    """Each parser, and the beginning of one of its frames."""
+    """Return each parser with the beginning of one of its frames."""
     lying = Framer(b"\xaa", lambda d: d[1] if len(d) > 1 else None, _accepts)
     answers = scip.ScipParser()
     return {
@@ -44,7 +44,7 @@ def parsers() -> dict[str, tuple[Feed, bytes]]:
 
 
 def part_fuzz(seconds: float) -> None:  # noqa: ARG001  # a number of inputs, however long they take
-    """A million inputs for each parser."""
+    """Feed a million inputs to each parser."""
     for name, (feed, head) in parsers().items():
         chance, crashes = random.Random(name), 0
         noise = chance.randbytes(1 << 16)

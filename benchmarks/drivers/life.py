@@ -1,4 +1,4 @@
-"""Unplugging again and again, and what all devices together do to loops that share their process."""
+"""Measures repeated unplugging, and the effect of all devices together on loops in the same process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CONTROL_S, EVENT_S = 0.002, 0.005
 
 
 def part_reconnect(seconds: float) -> None:  # noqa: ARG001  # a number of unplugs, however long they take
-    """Time to the first valid sample after the port has returned; descriptors and threads before and after."""
+    """Measure the time from the port's return to the first valid sample, and leaks of descriptors and threads."""
     process = psutil.Process()
     for name in ("tfmini", "modbus_io rtu", "scip tcp", "bota"):
         back_s: list[float] = []
@@ -50,10 +50,10 @@ def _back_after(device: Any, returned_s: float) -> float:
 
 
 def part_isolation(seconds: float) -> None:
-    """A control loop of 500 Hz and an event loop beside all drivers: running, all silent, all hung up.
+    """Measure a 500 Hz control loop and an event loop beside all drivers, with running, silent or disconnected devices.
 
-    As an ordinary process, which a busy machine puts off by itself (the floor: the same loops with no driver beside
-    them), and at real-time priority.
+    This is done at ordinary priority, where a busy machine delays the loops anyway (the floor is the same loops without
+    drivers), and at real-time priority.
     """
     names = tuple(item.name for item in BENCHES)
     for priority, word in PRIORITIES:
@@ -77,7 +77,7 @@ def part_isolation(seconds: float) -> None:
 
 
 def _lateness(seconds: float) -> tuple[float, float]:
-    """p99.9 in ms of how late a control loop and an event loop wake."""
+    """Return how late a control loop and an event loop wake: p99.9 in ms."""
     control_s: list[float] = []
     thread = threading.Thread(target=lambda: _control(seconds, control_s))
     thread.start()

@@ -1,4 +1,4 @@
-"""Arms: state streams, synchronous set-points, and the device's own watchdog."""
+"""Measures arms: state streams, synchronous set-points, and the device's own watchdog."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CYCLE_S = 0.004
 
 
 def part_ur(seconds: float) -> None:
-    """500 Hz state stream: dropped packages."""
+    """Count the dropped packages of a 500 Hz state stream."""
     with running(bench("ur"), {"rate_hz": 500.0}) as (device, far_side, _):
         rest = threading.Event()
         rest.wait(0.5)
@@ -40,11 +40,12 @@ def part_ur(seconds: float) -> None:
 
 
 def part_csp(seconds: float) -> None:
-    """Six axes in cyclic synchronous position at 250 Hz: SYNCs that were not sent, the far side in its own process.
+    """Count the SYNCs not sent to six axes in cyclic synchronous position at 250 Hz; the drives are in another process.
 
-    Over a pty, whose bytes a kernel thread of ordinary priority carries, and over TCP, whose bytes the sender carries
-    himself; as an ordinary process, where only the driver's owner thread asks for real-time priority, and with host and drives
-    at real-time priority (`chrt -r 10`). Beside each stands what a bare loop of 250 Hz misses: no driver can do better.
+    The links are a pty, whose bytes are carried by a kernel thread of ordinary priority, and TCP, whose bytes are
+    carried by the sender. The process has ordinary priority, where only the driver's owner thread requests real-time
+    priority, or host and drives have real-time priority (`chrt -r 10`). The misses of a bare 250 Hz loop are given for
+    comparison, because no driver can do better.
     """
     for (priority, word), transport in product(PRIORITIES, ("serial", "tcp")):
         what = f"CSP at 250 Hz, slcan over {transport}, {word}: SYNCs not sent"
@@ -59,7 +60,7 @@ def part_csp(seconds: float) -> None:
 
 
 def _bare_loop(seconds: float) -> float:
-    """Share of the periods that a loop of nothing but sleeping misses."""
+    """Return the fraction of periods that a loop that only sleeps misses."""
     due_s = time.monotonic()
     end_s, missed, ticks = due_s + seconds, 0, 0
     while due_s < end_s:
@@ -71,7 +72,7 @@ def _bare_loop(seconds: float) -> float:
 
 
 def _cyclic_positions(far: FarProcess, seconds: float) -> tuple[int, int, int]:
-    """SYNCs that the drives saw, that came too late to be sent, and that were held back for drives that owed answers."""
+    """Return the numbers of SYNCs that the drives received, that were too late to send, and that waited for answers."""
     item, options = bench("cia402"), {"rate_hz": 1.0 / CYCLE_S, "heartbeat_s": 1.0}
     device: Any = connect(Context(name="arm"), item.driver, {**far.addresses["cia402"], **options})
     with closing(device):
@@ -86,7 +87,7 @@ def _cyclic_positions(far: FarProcess, seconds: float) -> tuple[int, int, int]:
         while time.monotonic() < end_s:
             try:
                 device.command_position(start, deadline=deadline())
-            except CellError:  # a machine that stood still for a second: the drives' watchdog was quicker
+            except CellError:  # the machine stood still for a second, so the drives' watchdog tripped
                 device.enable(deadline=deadline(5.0))
             rest.wait(CYCLE_S)
         seen, missed, held = (counts() - before).tolist()
@@ -94,7 +95,7 @@ def _cyclic_positions(far: FarProcess, seconds: float) -> tuple[int, int, int]:
 
 
 def part_kill(seconds: float) -> None:
-    """Host process killed in motion: how long until the device's own watchdog stops the arm behind it."""
+    """Kill the host process during a motion and measure how long the device's own watchdog takes to stop the arm."""
     for name in ("ur", "cia402", "dynamixel"):
         stops_s = [_kill_once(bench(name)) for _ in range(max(3, int(seconds / 2)))]
         measured = f"{1e3 * max(stops_s):.0f} ms of {len(stops_s)}"

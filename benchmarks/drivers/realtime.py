@@ -1,4 +1,4 @@
-"""What a machine's other work does to a figure, and how a figure is measured without it."""
+"""Runs a measurement at real-time priority, so that other work on the machine does not disturb it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ PRIORITIES = ((0, "ordinary"), (REALTIME, "real-time"))
 
 @contextmanager
 def realtime(priority: int, far_pid: int) -> Iterator[bool]:
-    """Give this thread, those that it starts, and a far side's process a real-time priority, and take it back.
+    """Give this thread, the threads that it starts, and an emulator's process real-time priority in the `with` block.
 
     Args:
-        priority: 0 changes nothing.
+        priority: 0 to change nothing.
 
-    Yields whether the system allows it.
+    Yields whether the system permits it.
     """
     tasks = [0, *(int(entry.name) for entry in Path(f"/proc/{far_pid}/task").iterdir())]
     try:

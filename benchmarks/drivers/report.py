@@ -1,4 +1,4 @@
-"""What the parts share: the table's rows, deadlines, percentiles, rates."""
+"""Functions that the parts share: rows of the table, deadlines, percentiles, rates."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ READ_S = 0.3
 
 
 def deadline(duration_s: float = READ_S) -> Deadline:
-    """From now."""
+    """Return a deadline that begins now."""
     return Deadline.after(CLOCK, duration_s)
 
 
 def line(what: str, limit: str, measured: str, is_good: bool) -> None:
-    """One row of the table."""
+    """Print one row of the table."""
     print(f"{what:<52} {limit:>22} {measured:>34}  {'PASS' if is_good else 'FAIL'}", flush=True)
 
 
 def percentiles(samples_s: list[float]) -> tuple[float, float]:
-    """p50 and p99 in microseconds."""
+    """Return p50 and p99 in microseconds."""
     ordered = sorted(samples_s)
     return 1e6 * statistics.median(ordered), 1e6 * ordered[int(0.99 * len(ordered))]
 
 
 def rate(work: Callable[[], Any], seconds: float) -> float:
-    """Calls a second."""
+    """Return the calls per second."""
     count, end_s = 0, time.monotonic() + seconds
     while time.monotonic() < end_s:
         work()
@@ -39,7 +39,7 @@ def rate(work: Callable[[], Any], seconds: float) -> float:
 
 
 def cpu_rate(work: Callable[[], Any], seconds: float) -> float:
-    """Calls a second of this process's own time: what an idle machine would give."""
+    """Return the calls per second of this process's CPU time, as on an idle machine."""
     count, start_s = 0, time.process_time()
     while time.process_time() - start_s < seconds:
         for _ in range(10):

@@ -1,4 +1,4 @@
-"""Stamps against the emulator's own log of when each frame left."""
+"""Compares time stamps with the emulator's log of when each frame was sent."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TALKERS = ("tfmini", "ft300 stream", "netft", "bota", "scip serial", "lms200")
 
 
 def part_stamps(seconds: float) -> None:
-    """The distance of each stamp to the nearest frame of the log; the far side has a process of its own."""
+    """Measure the distance of each stamp to the nearest frame of the log; the emulator runs in another process."""
     for name in TALKERS:
         stamps_s, log_s = _record(name, min(seconds, 10.0))
         within = stamps_s[(stamps_s > log_s[0]) & (stamps_s < log_s[-1])]

@@ -1,4 +1,4 @@
-"""Real and simulated devices of a wire cell take each other's place, one kind after another, while the cell runs."""
+"""Exchanges real and simulated devices of a running cell, one kind after another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROUNDS = 3
 
 
 def part_swap(seconds: float) -> None:  # noqa: ARG001  # a number of swaps, however long they take
-    """Seconds from the order to the new device's first sample."""
+    """Measure the seconds from the request to the new device's first sample."""
     cell = load_cell(CELL)
     runtime = CellRuntime.start(cell, is_latched=lambda: False)
     swapper = runtime.objects[PREFIX + SWAPPER]

@@ -1,4 +1,4 @@
-"""Backings whose values tell which reading they are, and whether a value is one of the last true ones."""
+"""Backing devices whose values identify the reading, and checks that a value is one of the latest true ones."""
 
 from __future__ import annotations
 
@@ -20,52 +20,52 @@ SAME_MOMENT_S = 0.008  # two counts of a servo at the speed of `MovingArm` are 6
 
 
 class MovingArm(scripted.ScriptedArm):
-    """An arm whose joints tell the time: each rises at the same speed, for some seconds, and begins anew."""
+    """Arm whose joints encode the time: all rise at the same speed and restart every `TURN_S` seconds."""
 
     SPEED_RAD_PER_S, TURN_S = 0.5, 4.0
 
     def read_state(self, *, deadline: Deadline) -> Stamped[JointState]:
-        """Where it is now."""
+        """Return the present position."""
         stamped = super().read_state(deadline=deadline)
         moved_rad = self.SPEED_RAD_PER_S * (time.monotonic() % self.TURN_S)
         return replace(stamped, value=replace(stamped.value, position_rad=self.position_rad + moved_rad))
 
     def seconds(self, value: JointState) -> Any:
-        """Seconds since the beginning that each joint tells."""
+        """Return the seconds since the last restart that each joint encodes."""
         return (value.position_rad - self.position_rad) / self.SPEED_RAD_PER_S
 
     def taken_s(self, value: JointState) -> float:
-        """The oldest joint's time; it was not longer ago than one turn, and rounding may bring it before now."""
+        """Return when the oldest joint was read, within the last `TURN_S`; rounding may give a slightly later time."""
         now_s = time.monotonic() + SAME_MOMENT_S
         return now_s - float(np.max((now_s - self.seconds(value)) % self.TURN_S))
 
 
 class TimedForceTorque(scripted.ScriptedForceTorque):
-    """Remembers when each reading was taken."""
+    """Force/torque device that stores when each reading was taken."""
 
     def __init__(self) -> None:
         super().__init__()
         self._read_s: deque[float] = deque(maxlen=4096)
 
     def count(self, deadline: Deadline) -> tuple[int, float]:
-        """Index of this read and its time."""
+        """Count one read; return its index and time."""
         self._read_s.append(time.monotonic())
         return super().count(deadline)
 
     def taken_s(self, value: Wrench) -> float:
-        """By the index that the force tells."""
+        """Return when a value was taken, by the index that its force encodes."""
         ago = self.reads - round(value.force_n[0] / 0.01)
         return self._read_s[-1 - ago]
 
 
 def taken_s(value: Any, backing: Any) -> float:
-    """What the backing remembers."""
+    """Return when a value was taken, as the backing device stored it."""
     when_s: float = backing.taken_s(value)
     return when_s
 
 
 def true_wrench(value: Any, backing: Any) -> bool:
-    """All six components of one of the last 100 readings."""
+    """Return whether all six components equal one of the last 100 readings."""
     index = round(value.force_n[0] / 0.01)
     true = scripted.scripted_wrench(index)
     got, want = [*value.force_n, *value.torque_nm], [*true.force_n, *true.torque_nm]
@@ -73,20 +73,23 @@ def true_wrench(value: Any, backing: Any) -> bool:
 
 
 def true_distance(value: float, backing: Any) -> bool:
-    """A whole millimetre step of one of the last 100 readings."""
+    """Return whether the value equals one of the last 100 readings."""
     steps = (value - backing.first_m) / 0.001
     index = backing.reads % 1000
     return bool(abs(steps - round(steps)) < 1e-6 and (index - round(steps)) % 1000 <= 100)
 
 
 def true_centimetres(value: float, backing: Any) -> bool:
-    """One of the last 100 readings, to the centimetre."""
+    """Return whether the value equals one of the last 100 readings, rounded to a centimetre."""
     true_m = backing.first_m + 0.001 * (np.arange(backing.reads - 100, backing.reads + 1) % 1000)
     return bool(np.min(np.abs(np.round(true_m, 2) - value)) < 1e-6)
 
 
 def true_express(value: RangeImage, backing: Any) -> bool:
-    """One of the last 60 scans; its 384 measurements fall into 360 sectors, so each beam may be its neighbour's."""
+    """Return whether the value is one of the last 60 scans, where each beam may have a neighbour's distance.
+
+    The 384 measurements of a scan fall into 360 sectors.
+    """
     c, seen_m = backing.capabilities(), value.depth_m[0]
     seen = np.isfinite(seen_m)
     for index in range(max(1, backing.reads - 60), backing.reads + 1):
@@ -99,7 +102,7 @@ def true_express(value: RangeImage, backing: Any) -> bool:
 
 
 def true_scan(angles: Callable[[int], Any]) -> Callable[[RangeImage, Any], bool]:
-    """Beam for beam one of the last 60 scans."""
+    """Return a check that a value equals one of the last 60 scans, beam by beam."""
 
     def is_true(value: RangeImage, backing: Any) -> bool:
         angle_rad = angles(value.depth_m.shape[1])
@@ -114,32 +117,32 @@ def true_scan(angles: Callable[[int], Any]) -> Callable[[RangeImage, Any], bool]
 
 
 def scip_angles(count: int) -> Any:
-    """URG-04LX."""
+    """Return the beam angles of the URG-04LX, in radians."""
     return (np.arange(count) + 44.0 - 384.0) * (2 * np.pi / 1024)
 
 
 def sick_angles(count: int) -> Any:
-    """180 degrees."""
+    """Return beam angles over 180 degrees, in radians."""
     return np.radians(np.linspace(-90.0, 90.0, count))
 
 
 def turn_angles(count: int) -> Any:
-    """A turn, signed."""
+    """Return beam angles over a full turn, from -pi to pi."""
     return (np.arange(count) * (2 * np.pi / count) + np.pi) % (2 * np.pi) - np.pi
 
 
 def true_joints(value: Any, backing: Any) -> bool:
-    """All joints of one moment, to the last count of the servos."""
+    """Return whether all joints were read at the same time, to the resolution of the servos."""
     seconds = backing.seconds(value)
     apart_s = (seconds - seconds[0] + backing.TURN_S / 2.0) % backing.TURN_S - backing.TURN_S / 2.0
     return bool(np.ptp(apart_s) < SAME_MOMENT_S)
 
 
 def true_width(value: Any, backing: Any) -> bool:
-    """The jaws rest on a thing of 40 mm."""
+    """Return whether the jaws rest on the object of 40 mm."""
     return bool(abs(value.width_m - 0.04) < 4e-4 and backing.reads > 0)
 
 
 def true_lights(value: Any, backing: Any) -> bool:
-    """What is lit."""
+    """Return whether the value equals the lights that are on."""
     return bool(value == backing.on)

@@ -1,4 +1,4 @@
-"""Calls, rates and decoders on a good wire."""
+"""Measures calls, rates and decoders on a good link."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from drivers.transport.serial_link import open_serial
 
 
 def part_latency(seconds: float) -> None:
-    """A register read by the driver's bus against the same bytes over a bare pyserial port, alternating in one run."""
+    """Compare a register read by the driver's bus with the same bytes over a bare pyserial port, in alternation."""
     far_side = ft300.start(scripted.ScriptedForceTorque(), {})
     request = bytes.fromhex("090400b40006")
     request += crc_modbus(request).to_bytes(2, "little")
@@ -66,7 +66,7 @@ def part_latency(seconds: float) -> None:
 
 
 def part_rtu(seconds: float) -> None:
-    """Reads a second against pymodbus on the same emulator."""
+    """Compare the reads per second with pymodbus on the same emulator."""
     from pymodbus.client import ModbusSerialClient
 
     far_side = ft300.start(scripted.ScriptedForceTorque(), {})
@@ -90,7 +90,7 @@ def part_rtu(seconds: float) -> None:
 
 
 def part_decode(seconds: float) -> None:
-    """Points and frames a second of processor time."""
+    """Measure the points and frames decoded per second of CPU time."""
     data = scip.encode_ranges(np.arange(1081) % 4000)
     points = cpu_rate(lambda: decode_ranges_mm(data), seconds) * 1081
     line("SCIP ranges decoded, points/s", "20 M", f"{points / 1e6:.0f} M", points >= 20e6)

@@ -1,10 +1,11 @@
-"""A radius from touches: the same fusion that finds a panel's pose also measures what stands on it.
+"""Measures the radius of a post from touches, with the same fusion that finds the pose of a panel.
 
     python -m examples.paper.cylinder_radius
 
-A post of unknown radius and length is touched and ranged at places spread over its wall and top; two touches hit something
-else. `fuse` is called with a shape instead of fixed features, and gives pose, radius and length with their deviations. Then a
-post of which only a third of the wall can be reached, with a quarter of its points wrong, and a box.
+A post of unknown radius and length is measured by touch and range sensors at points spread over its wall and top; two
+touches hit something else. `fuse` is called with a shape instead of fixed features and returns pose, radius and length
+with their standard deviations. The second example is a post of which only a third of the wall can be reached, with a
+quarter of the points wrong; the third is a box.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from hal.geometry import UncertainPose, certain, perturbed, transform_rpy
 
 TOUCH_SIGMA_M, RANGE_SIGMA_M, ARC_SIGMA_M = 0.0002, 0.002, 0.0008
 BASE = certain(RigidTransform.identity())  # points are given in the base frame
-PRIOR_SIGMA = np.array([0.005] * 3 + [0.02] * 3)  # what the camera knew: 5 mm, 1.1 degrees
+PRIOR_SIGMA = np.array([0.005] * 3 + [0.02] * 3)  # uncertainty of the camera's pose: 5 mm, 1.1 degrees
 
 
 def sensed_point(
@@ -31,7 +32,7 @@ def sensed_point(
     sigma_m: float,
     rng: np.random.Generator,
 ) -> Measurement:
-    """A noisy point of `part`, as touch or range gives it: point-plane."""
+    """Return a noisy point on `part`, as a touch or range sensor measures it, as a point-plane measurement."""
     feature = shape.feature(part, shape.start, on_object_m)
     seen = base_from_object.apply(on_object_m) + rng.normal(0.0, sigma_m, 3)
     label = f"{part} {1e3 * sigma_m:.1f} mm"
@@ -40,14 +41,14 @@ def sensed_point(
 
 
 def believed(base_from_object: RigidTransform, rng: np.random.Generator) -> UncertainPose:
-    """The pose as the camera would have it."""
+    """Return the pose as the camera would estimate it: the true one with noise, and its covariance."""
     return UncertainPose(
         parent_from_child=perturbed(base_from_object, rng.normal(0.0, PRIOR_SIGMA)), covariance=np.diag(PRIOR_SIGMA**2)
     )
 
 
 def cylinder_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
-    """Fuse 15 touches, two of them wrong, and 20 range points on a post; the true post comes second."""
+    """Fuse 15 touches, two of them wrong, with 20 range points on a post; return the result and the true post."""
     rng = np.random.default_rng(seed)
     true, guess = Cylinder(radius_m=0.0312, length_m=0.118), Cylinder(radius_m=0.025, length_m=0.10)
     base_from_post = transform_rpy((0.7, 0.1, 0.4), (0.3, -0.4, 1.0))
@@ -67,7 +68,7 @@ def cylinder_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
     ]
     table = features.plane(
         (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), name="table"
-    )  # a fixed feature: the length is counted from here
+    )  # fixed feature: the length of the post is measured from here
     foot = [
         sensing.range_point(
             table, BASE, point_m=base_from_post.apply([x, y, 0.0]) + rng.normal(0.0, TOUCH_SIGMA_M, 3),
@@ -75,7 +76,7 @@ def cylinder_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
         )
         for x, y in ((0.06, 0.0), (-0.04, 0.05), (-0.03, -0.06))
     ]  # fmt: skip
-    for k in (3, 9):  # the finger met a cable, 12 mm before the surface
+    for k in (3, 9):  # the finger touched a cable, 12 mm in front of the surface
         m = touches[k]
         normal = guess.feature(m.part, guess.start, base_from_post.inv().apply(m.mu_m)).direction
         touches[k] = replace(m, mu_m=m.mu_m + 0.012 * base_from_post.rotation.apply(normal), label="cable")
@@ -83,9 +84,9 @@ def cylinder_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
 
 
 def arc_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
-    """Fuse 40 range points from one side of a post, ten of them on something else; the true post comes second.
+    """Fuse 40 range points from one side of a post, ten of them wrong; return the result and the true post.
 
-    They cover 120 degrees of the wall: over a part of a circle, radius and place of the axis nearly trade against each other.
+    They cover 120 degrees of the wall; over so short an arc, radius and axis position are strongly correlated.
     """
     rng = np.random.default_rng(seed)
     true, guess = Cylinder(radius_m=0.0405, length_m=0.15), Cylinder(radius_m=0.03, length_m=0.15, sigma_m=0.03)
@@ -95,7 +96,7 @@ def arc_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
         angle, height = rng.uniform(-np.pi / 3, np.pi / 3), rng.uniform(0.01, 0.14)
         on_wall = np.array([true.radius_m * np.cos(angle), true.radius_m * np.sin(angle), height])
         point = sensed_point(guess, "wall", on_wall, base_from_post, ARC_SIGMA_M, rng)
-        if k % 4 == 0:  # a cable before the post, or the wall behind its edge
+        if k % 4 == 0:  # a cable in front of the post, or the background behind its edge
             stray = base_from_post.rotation.apply([rng.choice([0.015, 0.025, -0.02]), 0.0, 0.0])
             point = replace(point, mu_m=point.mu_m + stray, label="cable")
         points.append(point)
@@ -103,7 +104,7 @@ def arc_case(seed: int = 0) -> tuple[FusedPose, Cylinder]:
 
 
 def box_case(seed: int = 0) -> tuple[FusedPose, Box]:
-    """Fuse three touches on each face of a box that is 10 mm larger than believed; the true box comes second."""
+    """Fuse three touches on each face of a box that is 10 mm larger than assumed; return the result and the truth."""
     rng = np.random.default_rng(seed)
     true, guess = Box(size_m=(0.25, 0.20, 0.06)), Box(size_m=(0.24, 0.19, 0.05))
     base_from_box = transform_rpy((0.8, -0.2, 0.5), (0.1, 0.2, -0.7))
@@ -119,7 +120,7 @@ def box_case(seed: int = 0) -> tuple[FusedPose, Box]:
 
 
 def report(title: str, answer: FusedPose, true: Shape) -> str:
-    """What was found, beside the truth."""
+    """Return the estimated values with their standard deviations beside the true ones, as text."""
     assert answer.shape is not None  # noqa: S101 - `fuse` fills it whenever a shape was given
     lines = [title]
     for name, truth in zip(answer.shape.names, true.start, strict=True):

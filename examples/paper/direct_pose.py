@@ -1,8 +1,9 @@
-"""The paper's direct pose of four lights (Section II-B) beside ours: python examples/paper/direct_pose.py
+"""Compares the paper's direct pose from four lights (Section II-B) with ours: python examples/paper/direct_pose.py
 
-Three lights give up to four poses, the fourth light picks one (Grunert 1841; Haralick et al., IJCV 13(3), 1994). It needs no
-starting value, but trusts its first three lights wholly. Ours minimises the reprojection error of all four, with covariance
-and every mirror pose. The paper states no errors, so both are measured here on the same drawn views.
+Three lights give up to four poses, and the fourth light selects one (Grunert 1841; Haralick et al., IJCV 13(3), 1994).
+The method needs no initial value, but fits its first three lights exactly. Ours minimises the reprojection error of all
+four and returns the covariance and all mirror poses. The paper states no errors, so both methods are measured here on
+the same simulated views.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ TILTS_DEG = (10.0, 30.0, 50.0)
 
 
 def direct_pose(points_m: Array, pixels: Array, camera: CameraIntrinsics) -> tuple[Array, Array]:
-    """(3, 3) rotation and (3,) translation camera_from_object by the paper's route.
+    """Return the (3, 3) rotation and (3,) translation camera_from_object by the paper's method.
 
     Args:
-        points_m: (4, 3), any quadrangle whose first three points are not on one line.
-        pixels: (4, 2) as measured, in the same order.
+        points_m: (4, 3) corners of any quadrangle, of which the first three are not on one line.
+        pixels: (4, 2) measured pixels, in the same order.
 
     Raises:
-        NotFound: the first three rays admit no pose.
+        NotFound: no pose projects the first three lights to their pixels.
     """
     matrix = np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]])
     count, turns, shifts = cv2.solveP3P(
@@ -53,7 +54,10 @@ def direct_pose(points_m: Array, pixels: Array, camera: CameraIntrinsics) -> tup
 
 
 def errors(tilt_deg: float, seed: int) -> Array:
-    """(VIEWS, 4) error of the direct pose and of ours in turn (deg), then in place (mm), where both find the right mirror."""
+    """Return (VIEWS, 4) errors: rotation (deg) of the direct pose and of ours, then position (mm) of both.
+
+    Views in which one of the two finds the mirror pose are left out, so there may be fewer rows.
+    """
     rng = np.random.default_rng(seed)
     found = []
     for _ in range(VIEWS):
@@ -71,7 +75,7 @@ def errors(tilt_deg: float, seed: int) -> Array:
 
 
 def table(tilts_deg: Sequence[float] = TILTS_DEG, seed: int = 1990) -> list[tuple[float, Array]]:
-    """The root mean square of `errors` at every tilt."""
+    """Return the root mean square of `errors` for every tilt."""
     return [(tilt_deg, np.sqrt(np.mean(errors(tilt_deg, seed) ** 2, axis=0))) for tilt_deg in tilts_deg]
 
 

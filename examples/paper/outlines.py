@@ -1,4 +1,4 @@
-"""Draw the outlines of an object at one or more poses as a camera would see it (paper, Fig. 13)."""
+"""Draws the outlines of an object at one or more poses as a camera would see it (paper, Fig. 13)."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from hal.geometry import transform
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-NEAREST_M = 0.02  # what comes closer to the lens is cut off
+NEAREST_M = 0.02  # near clipping plane
 CIRCLE_POINTS = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drawing:
-    """One object at one pose in one style.
+    """Object at one pose, drawn in one style.
 
     Attributes:
         base_from_object: the pose.
         outlines_m: polylines, each (K, 3) in the object frame.
-        colour: any that matplotlib knows, for example `#1f77b4`.
-        label: for the legend.
-        dashed: broken lines, for example for the true pose.
+        colour: any colour of matplotlib, for example `#1f77b4`.
+        label: text in the legend.
+        dashed: whether lines are dashed, for example for the true pose.
     """
 
     base_from_object: RigidTransform
@@ -44,7 +44,7 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sight:
-    """From where the drawing is seen: camera axes x right, y down, z forward."""
+    """Camera that the drawing is seen by; axes x right, y down, z forward."""
 
     base_from_camera: RigidTransform
     camera: Pinhole
@@ -60,12 +60,12 @@ def sight_of(
     width_px: int = 640,
     height_px: int = 480,
 ) -> Sight:
-    """A camera before the object's +z side, a little from above and from the right, that looks at its middle.
+    """Return a camera on the object's +z side, slightly above and to the right, that looks at its centre.
 
     Args:
-        base_from_object: where the object stands.
-        middle_m: (3,) what to look at, object frame.
-        distance_m: how far the lens is from there.
+        base_from_object: pose of the object.
+        middle_m: (3,) point to look at, object frame.
+        distance_m: distance of the camera from that point.
     """
     focal = 1.1 * width_px
     toward = np.array([0.25, 0.3, 1.0]) / np.linalg.norm([0.25, 0.3, 1.0])
@@ -78,7 +78,7 @@ def sight_of(
 
 
 def box_outlines(low_m: ArrayLike, high_m: ArrayLike) -> list[Array]:
-    """The edges of an axis-aligned box as 6 polylines: bottom, top, four uprights."""
+    """Return the edges of an axis-aligned box as 6 polylines: bottom, top, four uprights."""
     (x0, y0, z0), (x1, y1, z1) = np.asarray(low_m, float), np.asarray(high_m, float)
     ring = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
     bottom, top = (np.column_stack([ring, np.full(5, z)]) for z in (z0, z1))
@@ -86,14 +86,14 @@ def box_outlines(low_m: ArrayLike, high_m: ArrayLike) -> list[Array]:
 
 
 def circle_outline(centre_m: ArrayLike, radius_m: float) -> Array:
-    """A circle in a plane z = constant, (K, 3)."""
+    """Return a circle in a plane z = constant as a polyline (K, 3)."""
     angle = np.linspace(0.0, 2.0 * math.pi, CIRCLE_POINTS + 1)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     return np.asarray(np.asarray(centre_m, float) + radius_m * ring)
 
 
 def seen(drawing: Drawing, sight: Sight) -> list[Array]:
-    """The visible polylines of a drawing in the image, each (K, 2) px; parts behind the lens are cut off."""
+    """Return the visible polylines of a drawing in the image, each (K, 2) px; parts behind the camera are cut off."""
     camera_from_object = sight.base_from_camera.inv() * drawing.base_from_object
     lines: list[Array] = []
     for outline in drawing.outlines_m:
@@ -103,7 +103,7 @@ def seen(drawing: Drawing, sight: Sight) -> list[Array]:
 
 
 def _before_lens(points: Array) -> list[Array]:
-    """A polyline (K, 3) cut at the plane z = NEAREST_M: the pieces before the lens."""
+    """Return the pieces of a polyline (K, 3) in front of the plane z = NEAREST_M."""
     pieces: list[list[Array]] = [[]]
     for a, b in pairwise(points):
         depths = np.array([a[2], b[2]]) - NEAREST_M

@@ -1,7 +1,8 @@
-"""General quadrics: parallel Givens QR as the stable reference, additive moments for quick region decisions.
+"""Fits general quadrics: by parallel Givens QR, which is stable, or by additive moments, which are faster.
 
-q . m(X) = 0 with m = (x^2, y^2, z^2, xy, xz, yz, x, y, z, 1), |q| = 1. Points are centred and scaled first: the raw
-design matrix of a region half a metre away has condition 1e6, the centred one below 10.
+A quadric is q . m(X) = 0 with m = (x^2, y^2, z^2, xy, xz, yz, x, y, z, 1), |q| = 1. Points are first centred and
+scaled, because the design matrix of a region half a metre away has a condition number of 1e6, but below 10 when
+centred.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from perception.range import SurfaceType
 
 TERMS = 10
 FLAT_RATIO = 1e-6  # residual ratio below which a second quadric fits as well: the points do not determine one
-ZERO_RATIO = 0.02  # of the largest eigenvalue: smaller counts as zero when a quadric is named
+ZERO_RATIO = 0.02  # eigenvalues below this fraction of the largest one count as zero in the classification
 EQUAL_RATIO = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Quadric:
-    """`coefficients` (10,) over ((X - centre_m) / scale_m), unit length; `rms` algebraic residual."""
+    """Quadric: unit-length `coefficients` (10,) for (X - centre_m) / scale_m; `rms` is the algebraic residual."""
 
     coefficients: Array
     centre_m: Array
@@ -32,27 +33,28 @@ class Quadric:
     rms: float
 
     def value(self, points_m: Array) -> Array:
-        """q . m(X) at points (N, 3)."""
+        """Return q . m(X) for points (N, 3)."""
         return np.asarray(monomials((points_m - self.centre_m) / self.scale_m) @ self.coefficients)
 
     def matrix(self) -> tuple[Array, Array, float]:
-        """A (3, 3), b (3,), c of Y' A Y + 2 b' Y + c = 0 in centred, scaled coordinates."""
+        """Return A (3, 3), b (3,), c of Y' A Y + 2 b' Y + c = 0 in centred and scaled coordinates."""
         q = self.coefficients
         A = np.array([[q[0], q[3] / 2, q[4] / 2], [q[3] / 2, q[1], q[5] / 2], [q[4] / 2, q[5] / 2, q[2]]])
         return A, q[6:9] / 2, float(q[9])
 
 
 def monomials(points: Array) -> Array:
-    """(N, 10) design matrix of points (N, 3)."""
+    """Return the (N, 10) design matrix of points (N, 3)."""
     x, y, z = points.T
     return np.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, np.ones_like(x)], axis=1)
 
 
 def fit_qr(points_m: Array, *, leaves: int = 1, pool: ThreadPoolExecutor | None = None) -> Quadric:
-    """Quadric by a tree of Givens QR factors over `leaves` parts of the points (N, 3).
+    """Fit a quadric by a tree of Givens QR factorisations over `leaves` parts of the points (N, 3).
 
-    Each leaf reduces its rows to a 10x10 triangle; triangles are merged in pairs, log2(leaves) rounds, as the paper's
-    parallel Givens algorithm does on a cube. The answer is the last right singular vector of the final triangle.
+    Each leaf reduces its rows to a 10x10 triangle; triangles are merged in pairs in log2(leaves) rounds, as in the
+    paper's parallel Givens algorithm on a hypercube. The quadric is the last right singular vector of the final
+    triangle.
 
     Raises:
         NotObservable: fewer than 9 points, or more than one quadric fits them.
@@ -70,7 +72,7 @@ def fit_qr(points_m: Array, *, leaves: int = 1, pool: ThreadPoolExecutor | None 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Moments:
-    """Sum of m m' over points about a fixed centre and scale; two of them add, so regions merge in O(1)."""
+    """Sum of m m' over points for a fixed centre and scale; moments can be added, so regions are merged in O(1)."""
 
     total: Array
     centre_m: Array
@@ -88,19 +90,19 @@ class Moments:
         )
 
     def fit(self) -> Quadric:
-        """Quadric of these points; see `fit_qr` for errors. Accurate to about 4e-8 rad when centred and scaled."""
+        """Return the quadric of these points, accurate to about 4e-8 rad if centred and scaled; raises as `fit_qr`."""
         values, vectors = np.linalg.eigh(self.total)
         return _named(np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, 0], self.centre_m, self.scale_m, self.count)
 
 
 def moments(points_m: Array, *, centre_m: Array, scale_m: float) -> Moments:
-    """Moments of points (N, 3) about a given centre and scale."""
+    """Return the moments of points (N, 3) for a given centre and scale."""
     m = monomials((points_m - centre_m) / scale_m)
     return Moments(total=m.T @ m, centre_m=centre_m, scale_m=scale_m, count=len(points_m))
 
 
 def classify(quadric: Quadric) -> SurfaceType | None:
-    """The primitive that a quadric is, from its eigenvalues; None for hyperboloids, paraboloids and the empty set."""
+    """Return the type of a quadric from its eigenvalues; None for hyperboloids, paraboloids and the empty set."""
     A, b, c = quadric.matrix()
     values, vectors = np.linalg.eigh(A)
     size = np.abs(values).max()
@@ -121,7 +123,7 @@ def classify(quadric: Quadric) -> SurfaceType | None:
         if level * signs[0] <= 0:
             return None
         return SurfaceType.SPHERE if np.ptp(values) < EQUAL_RATIO * size else SurfaceType.ELLIPSOID
-    # A cone's apex lies on it; how far off counts against the distance from the apex to the data.
+    # The apex of a cone lies on it, with a tolerance that grows with the distance from the apex to the data.
     apex = t / values
     return SurfaceType.CONE if abs(level) < EQUAL_RATIO * size * max(float(apex @ apex), 1.0) else None
 
@@ -143,7 +145,7 @@ def _named(s: Array, q: Array, centre: Array, scale: float, count: int) -> Quadr
 
 @compiled
 def _triangle(rows: Array) -> Array:
-    """(10, 10) upper triangle R of rows (N, 10) by Givens rotations, one row at a time."""
+    """Return the (10, 10) upper triangle R of rows (N, 10) by Givens rotations, one row at a time."""
     n = rows.shape[1]
     R = np.zeros((n, n))
     row = np.empty(n)

@@ -22,21 +22,21 @@ from hal.errors import NotObservable
 from perception.range import OrthographicSensor, SurfaceType, analyse
 
 PAPER_REGIONS = 6  # "image was segmented into six regions", Fig. 10; no errors are given
-SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # of the codes that the scene fills, Fig. 7
+SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # fractions of the 8-bit range that the scene fills, Fig. 7
 SIDE_PX, PITCH_M = 256, 0.001
 SENSOR = OrthographicSensor(width_px=SIDE_PX, height_px=SIDE_PX, pixel_pitch_m=PITCH_M)
 NOISE_M = 0.00025
 TABLE_M, RELIEF_M = 0.6, 0.06
 LEAST_PIXELS = 60
-JUMP_M = 0.004  # between neighbours, of the smoothed depth
-CREASE_RAD = 0.35  # between the normals of neighbours
-FLAT_PER_M = 6.0  # mean curvature that counts as none
-FLAT_RMS_M = 0.0006  # left by a plane: above it, a region is offered to the quadric
+JUMP_M = 0.004  # step of the smoothed depth between neighbours that separates regions
+CREASE_RAD = 0.35  # angle between the normals of neighbours that separates regions
+FLAT_PER_M = 6.0  # a smaller mean curvature counts as zero
+FLAT_RMS_M = 0.0006  # a region with a larger residual of the plane fit is fitted by a quadric
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """Depth (H, W) in metres, the true labels (H, W) from 1 on, and the type of each."""
+    """Depth image (H, W) in metres, the true labels (H, W) from 1 on, and the type of each surface."""
 
     depth_m: Array
     labels: Labels
@@ -45,14 +45,14 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Regions:
-    """Labels (H, W) from 1 on, 0 = none, and the type of each, None where it has no name."""
+    """Labels (H, W) from 1 on, 0 for no region, and the type of each region, None if it is unknown."""
 
     labels: Labels
     types: tuple[SurfaceType | None, ...]
 
 
 def scene(seed: int) -> Scene:
-    """A table with a box, a ball, two pipes and a cone, seen straight down: six surfaces."""
+    """Draw a table with a box, a ball, two pipes and a cone, seen from straight above: six surfaces."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[:SIDE_PX, :SIDE_PX] * PITCH_M
     dx, dy = rng.uniform(-0.006, 0.006, (2, 5))
@@ -75,14 +75,14 @@ def scene(seed: int) -> Scene:
 
 
 def coded(depth_m: Array, share: float) -> tuple[Image, float, float]:
-    """The depth as 8-bit codes of which the scene fills a share, the depth of code 0 and the step between codes."""
+    """Return the depth as 8-bit codes, the depth of code 0 and the step; the scene fills `share` of the codes."""
     step = 1.1 * RELIEF_M / share / 255.0
     near = TABLE_M - 0.5 * RELIEF_M - 127.5 * step
     return np.clip(np.rint((depth_m - near) / step), 0, 255).astype(np.uint8), near, step
 
 
 def regions_of_1990(codes: Image, near_m: float, step_m: float) -> Regions:
-    """The paper's chain: median, gaussian, then range, orientation and curvature part the image."""
+    """Segment as the paper does: median, Gaussian, then division by range, orientation and curvature."""
     stretched = cv2.medianBlur(codes, 5).astype(np.float64)
     z = cv2.GaussianBlur(near_m + step_m * stretched, (0, 0), 1.5)
     gv, gu = np.gradient(z, PITCH_M)
@@ -108,7 +108,7 @@ def regions_of_1990(codes: Image, near_m: float, step_m: float) -> Regions:
 
 
 def _name(points_m: Array) -> SurfaceType | None:
-    """The type of the plane or quadric through points (N, 3)."""
+    """Return the type of the plane or quadric through points (N, 3)."""
     spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
     if spread[2] / np.sqrt(len(points_m)) < FLAT_RMS_M:
         return SurfaceType.PLANE
@@ -119,13 +119,13 @@ def _name(points_m: Array) -> SurfaceType | None:
 
 
 def regions_of_today(codes: Image, near_m: float, step_m: float) -> Regions:
-    """What `perception.range.analyse` makes of the same codes."""
+    """Segment the same codes by `perception.range.analyse`."""
     found = analyse(near_m + step_m * codes.astype(np.float64), SENSOR)
     return Regions(labels=found.labels, types=tuple(surface.type for surface in found.surfaces))
 
 
 def right(true: Scene, found: Regions, tolerance: float = 0.8) -> tuple[int, int]:
-    """How many surfaces one region overlaps by `tolerance` either way, and how many of these regions bear the name."""
+    """Return how many surfaces a region overlaps by `tolerance` either way, and how many of these are named."""
     hits, named = 0, 0
     for own, kind in enumerate(true.types, 1):
         mine: Mask = true.labels == own

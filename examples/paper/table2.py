@@ -30,13 +30,13 @@ INCH_MM = 25.4
 
 
 def outlines() -> list[Array]:
-    """Edges of the simulated panel and its block, and the six lights that tell front from back."""
+    """Return the edges of the simulated panel and its block, and the six lights, which show where the front is."""
     lights = [circle_outline((x, y, 0.0), 0.015) for x in (0.05, 0.4, 0.75) for y in (0.05, 0.45)]
     return [*box_outlines((0, 0, -0.1), (0.8, 0.5, 0)), *box_outlines((0.1, 0.1, 0), (0.35, 0.3, 0.06)), *lights]
 
 
 def robust(made: Problem, count: int) -> FusedPose | None:
-    """The robust fusion of the first `count` measurements, or None where it refuses."""
+    """Return the robust fusion of the first `count` measurements, or None if it refuses."""
     try:
         return fuse(made.measurements[:count])
     except Contradiction:
@@ -44,13 +44,13 @@ def robust(made: Problem, count: int) -> FusedPose | None:
 
 
 def errors(true: RigidTransform, pose: RigidTransform) -> tuple[float, float]:
-    """Position error in mm and angle in degrees."""
+    """Return the position error in mm and the rotation error in degrees."""
     delta = difference(true, pose)
     return 1e3 * float(np.linalg.norm(delta[:3])), float(np.degrees(np.linalg.norm(delta[3:])))
 
 
 def remark(answer: FusedPose | None) -> str:
-    """What the fusion says about itself."""
+    """Return what the fusion reports: free directions, rejected measurements, alternatives, or its refusal."""
     if answer is None:
         return "refused: no set of measurements agrees by more than chance"
     notes = [f"free: {free.words}" for free in answer.unobservable]
@@ -61,7 +61,7 @@ def remark(answer: FusedPose | None) -> str:
 
 
 def table(made: Problem) -> list[str]:
-    """One line per measurement added."""
+    """Return one line of the table per added measurement."""
     lines = [
         " n data |    paper         |  least squares    |     robust         | what it says",
         "        |     mm      deg  |     mm      deg   |     mm      deg    |",
@@ -80,7 +80,7 @@ def table(made: Problem) -> list[str]:
 
 
 def draw(made: Problem, folder: Path) -> None:
-    """Figure 13: actual pose (dashed), least squares and robust after each of the first six measurements."""
+    """Draw figure 13: actual pose (dashed), least squares and robust fusion after each of the first 6 measurements."""
     from matplotlib.figure import Figure
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -96,7 +96,7 @@ def draw(made: Problem, folder: Path) -> None:
 
 
 def poses_after(made: Problem, n: int) -> list[Drawing]:
-    """What Fig. 13 shows after n measurements."""
+    """Return the drawings of Fig. 13 after n measurements."""
     lines = outlines()
     plain = solve_from_many(made.measurements[:n], starts=32).base_from_object
     drawings = [
@@ -112,7 +112,7 @@ def poses_after(made: Problem, n: int) -> list[Drawing]:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("runs/table2"), help="folder for the drawing [%(default)s]")

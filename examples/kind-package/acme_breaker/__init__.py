@@ -1,1 +1,1 @@
-"""Circuit breakers on a DIN rail, as a kind of object that panelwright reads, throws and simulates."""
+"""Circuit breakers on a DIN rail: a kind of object that panelwright reads, operates and simulates."""

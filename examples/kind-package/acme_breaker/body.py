@@ -1,4 +1,4 @@
-"""A breaker in the simulated world: a handle with a latch that lets it reach `on` only from `off`."""
+"""Simulated breaker: a handle with a latch; after a trip it holds at `on` only if it has been at `off` before."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ HOUSING, WHITE_INK = (40, 41, 44), (235, 235, 235)
 
 @dataclass(slots=True, eq=False)
 class Latch(Detent):
-    """Rests at `on`, `off` or straight out; once straight out, it must come to `off` before `on` holds again."""
+    """Latch that rests at `on`, `off` or straight out; after a trip `on` holds only when `off` has been reached."""
 
     has_tripped: bool = False
 
     def nearest(self, x: float) -> float:
-        """The resting place next to `x`."""
+        """Return the resting place nearest to `x`."""
         low, high = self.places
         if self.has_tripped and x <= 0.8 * low:
             self.has_tripped = False
@@ -43,14 +43,14 @@ class Latch(Detent):
 
 
 class BreakerBody(Body[Breaker]):
-    """On, off or tripped."""
+    """Simulated body of a breaker in one of the states on, off and tripped."""
 
     def start(self, panel_object: Breaker, u: float) -> Start:
-        """Each of the three in a third of all worlds."""
+        """Return the initial state; each of the three has the same probability (`u` is uniform in [0, 1))."""
         return Start(place=(panel_object.tilt_rad, -panel_object.tilt_rad, 0.0)[int(3 * u)])
 
     def model(self, panel_object: Breaker, start: Start) -> ObjectModel:
-        """The handle with its bright tip."""
+        """Return the model of the handle with its bright tip."""
         reach, r, tilt = panel_object.bat_length_m, panel_object.bat_radius_m, panel_object.tilt_rad
         parts = [
             shape(at(0, 0, reach / 2), cylinder(0.7 * r, reach), STEEL),
@@ -63,7 +63,7 @@ class BreakerBody(Body[Breaker]):
         return ObjectModel(urdf=urdf, place=start.place)
 
     def mechanism(self, engine: Any, body: int, panel_object: Breaker, start: Start, effort_ratio: float) -> Latch:
-        """Snaps to where it may rest."""
+        """Return the latch that makes the handle snap to its resting places."""
         effort = panel_object.force_n * panel_object.bat_length_m * effort_ratio
         ends = (-panel_object.tilt_rad, panel_object.tilt_rad)
         return Latch(
@@ -71,7 +71,7 @@ class BreakerBody(Body[Breaker]):
         )
 
     def print_on(self, canvas: Canvas, panel_object: Breaker) -> None:
-        """The dark housing, I and O, and the label."""
+        """Draw the dark housing, the letters I and O, and the label."""
         (x, y), half = panel_object.position_m, panel_object.height_m / 2
         canvas.box((x, y), (panel_object.width_m, panel_object.height_m), HOUSING, round_m=0.001)
         canvas.text((x, y + 0.8 * half), "I", 0.004, WHITE_INK)
@@ -79,7 +79,7 @@ class BreakerBody(Body[Breaker]):
         canvas.label((x, y), half, panel_object.label)
 
     def truth(self, panel_object: Breaker, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """Where the handle rests."""
+        """Return the true state from the place where the handle rests."""
         place = place_of(mechanism)
         states = {"on": panel_object.tilt_rad, "off": -panel_object.tilt_rad, "tripped": 0.0}
         return ObjectTruth(name=panel_object.name, state=min(states, key=lambda s: abs(states[s] - place)), value=place)

@@ -1,4 +1,4 @@
-"""What a breaker is in a panel file."""
+"""Model of a breaker in a panel file."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from hal.panel import Envelope, Face, PanelObject, Positive, Rim, StateGoal, Tau
 
 
 class Breaker(PanelObject):
-    """Circuit breaker: its handle leans up (`on`), down (`off`), or stands straight out when it has `tripped`.
+    """Circuit breaker: its handle leans up (`on`) or down (`off`), or stands straight out (`tripped`).
 
-    One that has tripped must be thrown to `off` before it can be thrown to `on`.
+    A tripped breaker must be switched to `off` before it can be switched to `on`.
     """
 
     kind: Literal["breaker"] = "breaker"
@@ -30,30 +30,30 @@ class Breaker(PanelObject):
 
     @property
     def half_footprint_m(self) -> Vector2:
-        """Half the housing's sides."""
+        """Half width and half height of the housing."""
         return self.width_m / 2, self.height_m / 2
 
     def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """A box as high as a handle that stands straight out."""
+        """Return a box over the housing, as high as a handle that stands straight out."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.bat_length_m + 2 * self.bat_radius_m)
 
     @property
     def rim(self) -> Rim:
-        """The housing's border on the plate."""
+        """Outline of the housing on the plate."""
         return Rim(shape="rectangle", width_m=self.width_m, height_m=self.height_m)
 
     @property
     def goal(self) -> StateGoal:
-        """It can be thrown on or off; only a fault in its circuit trips it."""
+        """The states `on` and `off`; only a fault in its circuit trips a breaker."""
         return StateGoal(states=("on", "off"))
 
     @property
     def mission_rank(self) -> float:
-        """Last of all."""
+        """Rank after all other kinds."""
         return 6.0
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """The size of its outline."""
+        """Return the keys for width and height, from the outline."""
         width, height = taught.size_m
         return {"width_m": round(width, 4), "height_m": round(height, 4)}

@@ -1,4 +1,4 @@
-"""Throws a breaker: a closed fingertip sweeps its handle over; one that has tripped is thrown off first."""
+"""Switches a breaker: a closed fingertip pushes its handle over; a tripped breaker is first switched off."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def breaker(
     current: ObjectState | None = None,
     verify: Verify | None = None,
 ) -> SkillReport:
-    """Throw the breaker to `on` or `off`. From `tripped`, or when nobody knows its state, it goes through `off` to `on`.
+    """Switch the breaker to `on` or `off`; if it has tripped or its state is unknown, it is switched off before on.
 
     Args:
-        current: what the last look showed.
-        verify: the caller's second look.
+        current: state from the last image.
+        verify: reads the state again after the motion.
     """
 
     def stroke(attempt: Attempt) -> float:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from hal.errors import NotFound
 
-CORNER_SIGMA_PX = 0.1  # of a refined ChArUco corner; calibrations on sharp images leave 0.05 to 0.2 px rms
-DOT_SIGMA_PX = 0.05
-FEWEST_POINTS = 6
+# Noise of a refined ChArUco corner; calibrations on sharp images give residuals of 0.05 to 0.2 px rms.
+CORNER_SIGMA_PX = 0.1
+DOT_SIGMA_PX = 0.05  # noise of the middle of a dot
+FEWEST_POINTS = 6  # in a view of a board
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,8 +25,8 @@ class BoardView:
         points_m: (N, 3) in the board's (or panel's) frame.
         pixels_px: (N, 2) as measured.
         sigma_px: noise of each coordinate.
-        disc_m: radius of the flat disc that a point is the middle of; 0 for a corner. A disc's image has its middle
-            elsewhere, see `disc_offset_px`.
+        disc_m: radius of the flat disc whose middle a point is; 0 for a corner. The middle of a disc's image is not the
+            image of its middle, see `disc_offset_px`.
     """
 
     points_m: Array
@@ -36,7 +37,7 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Charuco:
-    """A chessboard with ArUco markers in its white squares: may be seen in part.
+    """A chessboard with ArUco markers in its white squares; a part of it may be out of view.
 
     `columns` x `rows` squares of `square_m` with markers of `marker_m` from OpenCV's dictionary `dictionary`.
     Frame: origin at the outer corner of the first square, x along the columns, y along the rows, z into the board.
@@ -49,18 +50,19 @@ class Charuco:
     dictionary: str = "DICT_5X5_100"
 
     def _board(self) -> Any:
+        """Build OpenCV's description of the board."""
         import cv2
 
         words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, words)
 
     def draw(self, square_px: int) -> NDArray[np.uint8]:
-        """The board to print: (rows * square_px, columns * square_px) gray, without a margin."""
+        """Return the board to print as a gray image (rows * square_px, columns * square_px), without a margin."""
         size = (self.columns * square_px, self.rows * square_px)
         return np.asarray(self._board().generateImage(size, marginSize=0, borderBits=1), np.uint8)
 
     def find(self, image: NDArray[np.uint8]) -> BoardView:
-        """The inner corners that are visible in a gray image (H, W).
+        """Find the inner corners that are visible in a gray image (H, W).
 
         Raises:
             NotFound: fewer than six corners.
@@ -80,9 +82,10 @@ class Charuco:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dots:
-    """A grid of `columns` x `rows` black dots, `spacing_m` apart, seen whole. Origin: first dot; z into the board.
+    """A grid of `columns` x `rows` black dots, `spacing_m` apart, which must be in view as a whole.
 
-    A grid that looks the same upside down has two readings; the pose of the board absorbs that.
+    Frame: origin at the first dot, z into the board. If the grid looks the same after half a turn, the order of its
+    dots is ambiguous; the pose of the board then differs by that half turn, and the calibration does not.
     """
 
     columns: int = 8
@@ -90,12 +93,12 @@ class Dots:
     spacing_m: float = 0.03
 
     def points_m(self) -> Array:
-        """(columns * rows, 3), row by row."""
+        """Return the points (columns * rows, 3), row by row."""
         y, x = np.mgrid[: self.rows, : self.columns]
         return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.spacing_m
 
     def find(self, image: NDArray[np.uint8]) -> BoardView:
-        """The dots in a gray image (H, W).
+        """Find the dots in a gray image (H, W).
 
         Raises:
             NotFound: not the whole grid is visible.
@@ -114,7 +117,7 @@ class Dots:
         )
 
     def _radius_m(self, image: NDArray[np.uint8], centres_px: Array) -> float:
-        """Of a dot: the area of the dark part round its centre over that of the board's cell there."""
+        """Return the radius of the dots, from the ratio of a dot's dark area to the area of one cell of the grid."""
         import cv2
 
         grid = centres_px.reshape(self.rows, self.columns, 2)

@@ -13,22 +13,26 @@ from hal.camera_model import project
 from hal.geometry import certain, matrix_of, transform
 from perception.calibration.hand_eye import HandEyeView, propose_next, stations
 
-EDGE_PX = 24.0  # a light this near the image's edge may be cut
-LIGHTS_CONE_RAD = 0.95  # 0.6 rad leave the camera's depth in the hand uncertain by half as much again
+EDGE_PX = 24.0  # a light nearer to the image's edge may be cut off
+LIGHTS_CONE_RAD = 0.95  # half angle; with 0.6 rad the camera's position along its axis would be 1.5 times as uncertain
 PLATE_CONE_RAD = 0.6
-REACH_STEPS = (0.8, 1.0, 1.2, 1.45, 1.7)  # distances, as shares of the nearest that shows everything upright
-PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)  # a plane says nothing of shifts in it and of turns about its normal
-WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)
+REACH_STEPS = (0.8, 1.0, 1.2, 1.45, 1.7)  # distances, relative to the shortest one from which everything is in view
+# Of a scan; a plane does not determine shifts in it, nor rotations about its normal.
+PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)
+WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)  # tried angles of the wrist's joints, relative to the parking place
 
 Propose = Callable[[Sequence[RigidTransform], Sequence[RigidTransform]], int]
-"""Given the flange poses so far and the candidates: which of these is best next."""
+"""A function of the flange poses so far and the candidates that returns the index of the best candidate."""
 
 
 def around(
     base_from_target: RigidTransform, flange_from_sensor: RigidTransform, distance_m: float, *, steps: Sequence[float],
     cone_rad: float,
 ) -> list[RigidTransform]:  # fmt: skip
-    """Flange poses from which the sensor looks at the target's middle: a cone, several distances, four rolls."""
+    """Return flange poses from which the sensor looks at the target's middle.
+
+    They lie in a cone, at several distances (`steps` times `distance_m`), with four rolls about the line of sight.
+    """
     found = []
     for share in steps:
         for k, flange in enumerate(
@@ -44,7 +48,7 @@ def in_view(
     flange: RigidTransform, flange_from_camera: RigidTransform, base_from_points: RigidTransform, points_m: Array,
     lens: CameraIntrinsics,
 ) -> bool:  # fmt: skip
-    """Whether all points are in the image, clear of its edge."""
+    """Return whether all points are in the image, at least `EDGE_PX` from its edge."""
     seen = ((flange * flange_from_camera).inv() * base_from_points).apply(points_m)
     if (seen[:, 2] < 0.1).any():
         return False
@@ -54,7 +58,7 @@ def in_view(
 
 
 def plate_view(target: RigidTransform) -> Array:
-    """Information of a scan of the plate: it constrains height and tilts only."""
+    """Return the expected covariance (6, 6) of a pose from a scan of the plate: it determines height and tilts only."""
     turn = np.kron(np.eye(2), matrix_of(target))
     return np.asarray(turn @ np.diag(np.square(PLATE_SIGMA)) @ turn.T)
 
@@ -78,11 +82,13 @@ def by_plate(flange_from_sensor: RigidTransform, base_from_plate: RigidTransform
 def wrist_turns(
     park_rad: Array, limits_rad: tuple[Array, Array], base_from_sensor: Callable[[Array], Array]
 ) -> list[Array]:
-    """Joint vectors about the parking place with the wrist turned every way, those first that spread gravity most.
+    """Return joint vectors around the parking place with different wrist angles, in the order of their use.
+
+    Each next one adds most to the information about the direction of gravity in sensor axes.
 
     Args:
         limits_rad: lowest and highest joint vector.
-        base_from_sensor: (3, 3) rotation of the sensor at a joint vector.
+        base_from_sensor: returns the (3, 3) rotation of the sensor at a joint vector.
     """
     low, high = limits_rad
     grid = [
@@ -94,7 +100,7 @@ def wrist_turns(
     information = 1e-3 * np.eye(3)
     ordered: list[Array] = []
     while left:
-        # Greedy D-optimality of the directions that gravity comes from.
+        # Greedy D-optimal design over the directions of gravity.
         gain = [float(d @ np.linalg.solve(information, d)) for d in down]
         best = int(np.argmax(gain))
         d = down.pop(best)

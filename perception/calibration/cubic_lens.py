@@ -14,7 +14,7 @@ from hal.calibration import CameraIntrinsics
 from hal.camera_model import project, undistort_pixels
 from perception.calibration.boards import BoardView
 
-GRID = 24  # points along each side of the frame at which the bias is taken
+GRID = 24  # points along each side of the image at which the bias is evaluated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -23,8 +23,8 @@ class CubicLens:
 
     Attributes:
         coefficients: (10, 2), one column per axis, over the monomials of `cubic_monomials`.
-        centre_px, scale_px: the monomials are taken of `(pixel - centre_px) / scale_px`, for conditioning.
-        bias_px: root mean square model error of the cubic over the frame; more data do not reduce this bias.
+        centre_px, scale_px: for numerical conditioning, the monomials are those of `(pixel - centre_px) / scale_px`.
+        bias_px: root mean square model error of the cubic over the image; more data do not reduce it.
     """
 
     coefficients: Array
@@ -33,12 +33,12 @@ class CubicLens:
     bias_px: float
 
     def ideal(self, pixels_px: ArrayLike) -> Array:
-        """(N, 2) ideal pixels of (N, 2) distorted ones."""
+        """Return the ideal pixels (N, 2) of distorted ones (N, 2)."""
         return cubic_monomials(pixels_px, self.centre_px, self.scale_px) @ self.coefficients
 
 
 def cubic_monomials(pixels_px: ArrayLike, centre_px: tuple[float, float], scale_px: float) -> Array:
-    """(N, 10) monomials 1, x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3 of the scaled pixel."""
+    """Return the monomials (N, 10) 1, x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3 of the scaled pixels."""
     x, y = ((np.asarray(pixels_px, float) - centre_px) / scale_px).T
     one = np.ones_like(x)
     return np.stack([one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1)
@@ -47,7 +47,7 @@ def cubic_monomials(pixels_px: ArrayLike, centre_px: tuple[float, float], scale_
 def fit_cubic(
     views: Sequence[BoardView], intrinsics: CameraIntrinsics, poses: Sequence[RigidTransform]
 ) -> tuple[CubicLens, Array]:
-    """The paper's correction: least squares of the ideal pixels of the points over cubics of the measured ones.
+    """Fit the paper's correction: linear least squares of the points' ideal pixels over cubics of the measured ones.
 
     Returns: the correction, and the (10, 10) covariance of the coefficients of one axis (px^2).
     """

@@ -1,8 +1,8 @@
-"""Hand-eye calibration of the camera mount and the target's pose from views of one target: A_i X B_i = Z.
+"""Hand-eye calibration of the camera's mount and the target's pose from views of one target: A_i X B_i = Z.
 
-A_i = base_from_flange, X = flange_from_camera, B_i = camera_from_target, Z = base_from_target. The closed form of the
-rotations initialises a maximum-likelihood fit of X and Z together, weighted by the covariance of every B_i (and of the
-arm). Covariances are over translation then rotation in the parent's axes.
+A_i = base_from_flange, X = flange_from_camera, B_i = camera_from_target, Z = base_from_target. A closed-form solution
+is the start of a maximum-likelihood fit of X and Z together, weighted by the covariance of every B_i and of the arm.
+Covariances are over translation, then rotation, in the parent's axes.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, matrix_of, perturbed, skew, transform
 from hal.least_squares import Minimum, descend
 
-LEAST_AXIS_SPREAD = 0.02  # of sin^2 between the turns' axes: 8 degrees; with less, one coordinate of X is mostly noise
-LEAST_TURN_RAD = 0.05
-LIMIT_M = 0.002
-LIMIT_RAD = 0.01
-OUTLIER_CHI_SQUARE = 22.5  # chi-square 6 leaves 0.1 % above it
+LEAST_AXIS_SPREAD = 0.02  # mean sin^2 between rotation axes: 8 degrees; with less, one coordinate of X is mostly noise
+LEAST_TURN_RAD = 0.05  # smaller rotations between two stations are not used to judge the spread
+LIMIT_M = 0.002  # largest accepted standard deviation of the mount's position, in its worst direction
+LIMIT_RAD = 0.01  # the same for its orientation
+OUTLIER_CHI_SQUARE = 22.5  # a chi-square variable with 6 degrees of freedom exceeds it with a probability of 0.1 %
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HandEyeView:
-    """One station: where the arm says its flange is, and where the camera sees the target."""
+    """One station: the flange pose as the arm reports it, and the target's pose as the camera measures it."""
 
     base_from_flange: RigidTransform
     camera_from_target: UncertainPose
@@ -36,14 +36,16 @@ class HandEyeView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HandEye:
-    """The calibration.
+    """Result of the hand-eye calibration.
 
     Attributes:
         flange_from_camera, base_from_target: X and Z with their 6x6 covariances.
         covariance: 12x12 of X and Z together.
-        chi_square, degrees: of the fit; their ratio is near 1 when the stated noise is right.
-        residuals: (N, 6) base axes, m and rad, of A_i X B_i against Z.
-        used: views kept; the others disagree with the rest by more than chance (`OUTLIER_CHI_SQUARE`).
+        chi_square, degrees: chi-square of the fit and its degrees of freedom; their ratio is near 1 if the stated noise
+        is
+            right.
+        residuals: (N, 6) difference between A_i X B_i and Z, base axes, m and rad.
+        used: indices of the views kept; the others are outliers (`OUTLIER_CHI_SQUARE`).
     """
 
     flange_from_camera: UncertainPose
@@ -58,16 +60,18 @@ class HandEye:
 def calibrate_hand_eye(
     views: Sequence[HandEyeView], *, arm_sigma_m: float = 1e-4, arm_sigma_rad: float = 1e-4
 ) -> HandEye:
-    """X and Z from three views or more whose turns have different axes.
+    """Estimate X and Z from three or more views between which the hand has rotated about different axes.
 
     Args:
-        views: stations; the covariance of `camera_from_target` weighs them.
+        views: stations; the covariance of `camera_from_target` determines their weight.
         arm_sigma_m, arm_sigma_rad: repeatability of the arm, added to every station.
 
     Raises:
         InvalidRequest: fewer than three views.
-        NotObservable: the hand turned about one axis only (or not at all), or too little for `LIMIT_M`, `LIMIT_RAD`;
-            the message says what to do and `details["next_axis"]` names the axis (flange frame) to turn about next.
+        NotObservable: the hand rotated about one axis only (or not at all), or the result is less certain than
+        `LIMIT_M`,
+            `LIMIT_RAD`; the message says what to do, and `details["next_axis"]` is the axis (flange frame) about which
+            to rotate next.
 
     Source: Park, Martin, IEEE TRA 10(5), 1994 (closed form); Dornaika, Horaud, IEEE TRA 14(4), 1998 (A X B = Z).
     """
@@ -96,10 +100,12 @@ def calibrate_hand_eye(
 
 
 def check_turns(views: Sequence[HandEyeView]) -> None:
-    """Refuse stations whose relative turns share one axis.
+    """Check that the rotations between the stations have different axes.
 
     Raises:
-        NotObservable: X's shift along that axis stays free; `details["next_axis"]` is the axis to turn about.
+        NotObservable: they share one axis, so that the shift of X along it is not determined; `details["next_axis"]` is
+        the
+            axis about which to rotate next.
     """
     spread, axis = _axis_spread([view.base_from_flange for view in views])
     if spread < LEAST_AXIS_SPREAD:
@@ -114,28 +120,35 @@ def check_turns(views: Sequence[HandEyeView]) -> None:
 
 
 def _axis_spread(flanges: Sequence[RigidTransform]) -> tuple[float, Array]:
-    """Spread of the turns' axes (mean sin^2 in the second direction, 0..0.5) and their main axis, flange frame."""
+    """Return the spread of the rotation axes between flange poses, and their main axis in the flange frame.
+
+    The spread is the mean sin^2 of their angle from the main axis in the second direction, 0 to 0.5.
+    """
     R = np.array([matrix_of(flange) for flange in flanges])
     turns, _ = _relative_turns(R)
     angles = np.linalg.norm(turns, axis=1)
     large = angles > LEAST_TURN_RAD
     if not large.any():
         return 0.0, np.array([0.0, 0.0, 1.0])
-    # A small turn tells less about its axis.
+    # The axis of a small rotation is less certain, so it counts less.
     axes = turns[large] / angles[large, None] * np.minimum(angles[large, None] / 0.3, 1.0)
     values, vectors = np.linalg.eigh(axes.T @ axes / len(axes))
     return float(values[1]), vectors[:, 2]
 
 
 def _relative_turns(R: Array) -> tuple[Array, Array]:
-    """Rotation vectors of R_i^T R_j for every pair, and the pairs (P, 2)."""
+    """Return the rotation vectors (P, 3) of R_i^T R_j for every pair, and the pairs (P, 2)."""
     pairs = np.array(list(combinations(range(len(R)), 2)))
     relative = R[pairs[:, 0]].swapaxes(1, 2) @ R[pairs[:, 1]]
     return np.asarray(Rotation.from_matrix(relative).as_rotvec()), pairs
 
 
 def _closed_form(stack: _Stack) -> tuple[RigidTransform, RigidTransform]:
-    """Closed form (Park and Martin): align the rotation vectors of A_ij and B_ij, then solve linearly for the translations."""
+    """Return X and Z in closed form (Park and Martin).
+
+    Aligns the rotation vectors of A_ij and B_ij, the motions between two stations, then solves linearly for the
+    translations.
+    """
     turns_a, pairs = _relative_turns(stack.Ra)
     turns_b, _ = _relative_turns(stack.Rb.swapaxes(1, 2))
     rx = Rotation.align_vectors(turns_a, turns_b)[0]
@@ -164,6 +177,7 @@ class _Stack:
 
     @classmethod
     def of(cls, views: Sequence[HandEyeView]) -> _Stack:
+        """Collect the arrays of the views."""
         a = [view.base_from_flange for view in views]
         b = [view.camera_from_target.parent_from_child for view in views]
         return cls(
@@ -174,7 +188,7 @@ class _Stack:
 
 
 def _residuals(stack: _Stack, x: RigidTransform, z: RigidTransform) -> Array:
-    """(N, 6) residuals: translation and rotation between A X B and Z, base axes."""
+    """Return the residuals (N, 6): translation and rotation from Z to A X B, base axes."""
     Rx, Rz = matrix_of(x), matrix_of(z)
     shift = np.einsum("nij,nj->ni", stack.Ra, stack.tb @ Rx.T + x.translation) + stack.ta - z.translation
     turn = Rotation.from_matrix(stack.Ra @ Rx @ stack.Rb @ Rz.T).as_rotvec()
@@ -182,7 +196,7 @@ def _residuals(stack: _Stack, x: RigidTransform, z: RigidTransform) -> Array:
 
 
 def _jacobians(stack: _Stack, x: RigidTransform) -> tuple[Array, Array, Array]:
-    """(N, 6, 6) derivatives of A X B by perturbations of A, X and B."""
+    """Return the derivatives (N, 6, 6) of A X B with respect to perturbations of A, of X and of B."""
     Rx = matrix_of(x)
     lever_b = stack.tb @ Rx.T
     lever_x = np.einsum("nij,nj->ni", stack.Ra, x.translation + lever_b)
@@ -196,12 +210,13 @@ def _jacobians(stack: _Stack, x: RigidTransform) -> tuple[Array, Array, Array]:
 
 
 def _noise(stack: _Stack, x: RigidTransform, arm: Array) -> Array:
-    """(N, 6, 6) covariance of the residuals at the truth."""
+    """Return the covariances (N, 6, 6) of the residuals that noise of arm and camera causes."""
     by_a, _, by_b = _jacobians(stack, x)
     return np.asarray(by_a @ arm @ by_a.swapaxes(1, 2) + by_b @ stack.cov_b @ by_b.swapaxes(1, 2))
 
 
 def _chi_squares(stack: _Stack, x: RigidTransform, z: RigidTransform, arm: Array) -> Array:
+    """Return the chi-square (N,) of each station."""
     e = _residuals(stack, x, z)
     return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(_noise(stack, x, arm), e[:, :, None])[:, :, 0]))
 
@@ -209,7 +224,8 @@ def _chi_squares(stack: _Stack, x: RigidTransform, z: RigidTransform, arm: Array
 def _fit(
     stack: _Stack, start: tuple[RigidTransform, RigidTransform], arm: Array
 ) -> tuple[tuple[RigidTransform, RigidTransform], Minimum]:
-    # The weights depend on X through levers only; frozen at the start and then once more, they are exact enough.
+    """Fit X and Z by weighted nonlinear least squares, starting at `start`."""
+    # The weights depend on X only through levers, so it is enough to compute them at the start and once more.
     state = start
     by_z = -np.tile(np.eye(6), (len(stack.ta), 1, 1))
     for _ in range(2):
@@ -228,10 +244,12 @@ def _fit(
 
 
 def check_accuracy(covariance: Array, count: int, *, limit_m: float = LIMIT_M, limit_rad: float = LIMIT_RAD) -> None:
-    """Refuse a mount (first six rows of `covariance`) that `count` views leave too uncertain.
+    """Check that the covariance of a mount, the first six rows of `covariance`, is within the limits.
 
     Raises:
-        NotObservable: one sigma of its worst direction is above a limit; `details["next_axis"]` helps.
+        NotObservable: the standard deviation in the worst direction is above a limit; `details["next_axis"]` is the
+        axis
+            about which to rotate next. `count` is the number of views, for the message.
     """
     values, vectors = np.linalg.eigh(covariance[:3, :3])
     turn = np.linalg.eigvalsh(covariance[3:6, 3:6])
@@ -252,15 +270,15 @@ def propose_next(
     done: Sequence[HandEyeView], result: tuple[RigidTransform, RigidTransform], candidates: Sequence[RigidTransform],
     *, view_covariance: Callable[[RigidTransform], Array], arm_sigma_m: float = 1e-4, arm_sigma_rad: float = 1e-4,
 ) -> tuple[int, float]:  # fmt: skip
-    """Choose the flange pose to go to next: the one that reduces the covariance of X most.
+    """Choose the next flange pose: the one that reduces the covariance of X most.
 
     Args:
         done: the stations so far (one or more).
-        result: X and Z as far as known (nominal values suffice).
+        result: X and Z as far as they are known; nominal values suffice.
         candidates: base_from_flange poses from which the target is in view.
-        view_covariance: the expected 6x6 covariance of a view's camera_from_target.
+        view_covariance: returns the expected 6x6 covariance of a camera_from_target.
 
-    Returns: index into `candidates`, and log det of X's covariance after it (lower is better).
+    Returns: index into `candidates`, and the log determinant of X's covariance with that pose (lower is better).
 
     Raises:
         InvalidRequest: no candidates.
@@ -277,7 +295,7 @@ def propose_next(
         J = np.hstack([_jacobians(stack, x)[1][0], -np.eye(6)])
         return np.asarray(J.T @ np.linalg.solve(_noise(stack, x, arm)[0], J))
 
-    # A weak prior (0.1 m, 0.3 rad) keeps the first few stations comparable.
+    # A weak prior (0.1 m, 0.3 rad) makes the covariance finite when there are only a few stations.
     known = np.diag([1e2] * 3 + [1e1] * 3 + [1e2] * 3 + [1e1] * 3)
     known = known + sum((information(view.base_from_flange) for view in done), np.zeros((12, 12)))
     scores = []
@@ -292,9 +310,9 @@ def stations(
     base_from_target: RigidTransform, flange_from_camera: RigidTransform, *, distance_m: float, count: int = 40,
     cone_rad: float = 0.7,
 ) -> list[RigidTransform]:  # fmt: skip
-    """Candidate flange poses that look at the target's middle from a cone about its normal (z), with different rolls.
+    """Return flange poses from which the camera looks at the target's middle, in a cone about its normal (z).
 
-    They lie on a spiral (golden angle), so that any number of them covers the cone evenly.
+    They lie on a spiral (golden angle), so that any number of them covers the cone evenly, and have different rolls.
     """
     found = []
     for k in range(count):

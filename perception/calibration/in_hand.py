@@ -1,10 +1,10 @@
-"""Joint calibration of a camera on the hand from known points seen from many poses: mount, target and lens in one fit.
+"""Joint calibration of a camera on the hand from views of known points: mount, target and lens in one fit.
 
 Pixel: u = lens((A X)^-1 Z (p + e)) + s with A = base_from_flange, X = flange_from_camera, Z = base_from_target. X, Z,
 the lens, the errors e of the points and two parameters of s (`InHandState.offset`) are estimated together. Prior
-knowledge of lens, e and s (one sigma each) enters as measurements, and the arm's own repeatability is marginalised into
-the noise of every view, so the covariance of X includes all these contributions. Covariances are over translation then
-rotation in the parent's axes.
+knowledge of lens, e and s enters as measurements with standard deviations. The repeatability of the arm is part of the
+noise of every view, so the covariance of X includes all these contributions. Covariances are over translation, then
+rotation, in the parent's axes.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ from hal.least_squares import Minimum, descend
 from perception.calibration.hand_eye import HandEyeView, check_accuracy, check_turns
 from perception.calibration.intrinsics import NAMES, lens_jacobian, parameters, with_parameters
 
-FREE = ("fx", "fy", "cx", "cy", "k1")
+FREE = ("fx", "fy", "cx", "cy", "k1")  # lens parameters that are estimated
 INDEX = [NAMES.index(name) for name in FREE]
-LIMIT_M = 0.001  # one sigma: a mount that is known less well than this is worse than a drawing
+LIMIT_M = 0.001  # largest accepted standard deviation of the mount; a drawing is as good as a larger one
 LIMIT_RAD = 0.0035
-OUTLIER_P = 1e-4  # a view that chance alone explains less often than this is left out
+OUTLIER_P = 1e-4  # a view is an outlier if noise gives its residuals with a smaller probability
 FEWEST_VIEWS = 4
-ROUGHLY = np.repeat([0.1, 0.3, 0.1, 0.3], 3)  # m and rad: mount and target before any view, so that first ones compare
-LEVER_M = 0.1  # at which a turn of the mount counts as much as a shift
+# Prior standard deviations of mount and target in m and rad, so that the first views can be compared.
+ROUGHLY = np.repeat([0.1, 0.3, 0.1, 0.3], 3)
+LEVER_M = 0.1  # distance at which a rotation error of the mount is converted to a shift
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InHandView:
-    """One station: where the arm says its flange is, the target's points in the image (N, 2), covariance (N, 2, 2)."""
+    """One station: flange pose as the arm reports it, points in the image (N, 2), and their covariances (N, 2, 2)."""
 
     base_from_flange: RigidTransform
     pixels_px: Array
@@ -46,14 +47,16 @@ class InHandView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InHandState:
-    """What is estimated.
+    """The quantities that are estimated.
 
     Attributes:
         flange_from_camera, base_from_target, intrinsics: X, Z and the lens.
         point_errors_m: (N, 3) errors of the target's points, target frame.
-        offset: (2,) what all views share of the difference between a lamp's middle and that of its bright spot: how many
-            times the offset of a flat disc seen aslant (`disc_offset_px`), which is towards its near side, and px
-            outwards in the image, per squared tangent. A lamp has a body and a glow, and a lens shades.
+        offset: (2,) model of the distance between the middle of a lamp and that of its bright spot, common to all
+        views.
+            The first is a factor of the offset of a flat disc seen obliquely (`disc_offset_px`), which is towards its
+            near side; the second is in px outwards in the image, per squared tangent of the angle from the optical
+            axis. They differ from 1 and 0 because a lamp has a body and a glow, and a lens shades.
     """
 
     flange_from_camera: RigidTransform
@@ -70,7 +73,7 @@ class Beforehand:
     Attributes:
         focal_ratio, centre_px, k1: of the lens.
         point_m: of each coordinate of the target's points.
-        disc_m: radius of a flat disc that a point is the middle of; 0 for a corner or a cross. Not a sigma.
+        disc_m: radius of the flat disc whose middle a point is; 0 for a corner or a cross. It is no standard deviation.
         offset: of both parameters of `InHandState.offset`.
         arm_m, arm_rad: repeatability of the arm, independent at every station.
     """
@@ -85,20 +88,24 @@ class Beforehand:
     offset: tuple[float, float] = (2.0, 0.1)
 
 
-UNKNOWN_LENS = Beforehand(focal_ratio=0.02, centre_px=15.0, k1=0.1)  # what a maker's data sheet is worth
+# Accuracy of a lens that is known from its data sheet.
+UNKNOWN_LENS = Beforehand(focal_ratio=0.02, centre_px=15.0, k1=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InHandCalibration:
-    """The calibration.
+    """Result of the joint calibration.
 
     Attributes:
         flange_from_camera, base_from_target: with covariance.
-        intrinsics, lens_sigma: the lens, and one sigma of each of `FREE`.
-        target_from_camera: (V, 4, 4) where the used views were taken from.
-        residuals_px: (V, N, 2) of the used views, measured less predicted; rms_px: of both coordinates together.
-        chi_square, degrees: of the fit; their ratio is near 1 when the stated noise is right.
-        used: views kept.
+        intrinsics, lens_sigma: the lens, and the standard deviation of each parameter in `FREE`.
+        target_from_camera: (V, 4, 4) poses of the camera in the used views.
+        residuals_px: (V, N, 2) measured minus predicted pixels of the used views.
+        rms_px: their root mean square, both coordinates together.
+        chi_square, degrees: chi-square of the fit and its degrees of freedom; their ratio is near 1 if the stated noise
+        is
+            right.
+        used: indices of the views kept.
     """
 
     flange_from_camera: UncertainPose
@@ -117,19 +124,19 @@ def calibrate_in_hand(
     views: Sequence[InHandView], points_m: Array, start: InHandState, known: Beforehand,
     *, limit_m: float = LIMIT_M, limit_rad: float = LIMIT_RAD,
 ) -> InHandCalibration:  # fmt: skip
-    """Mount, target pose and lens from four views or more.
+    """Estimate mount, target pose and lens from four or more views.
 
     Args:
-        views: stations; every view shows all points, in their order.
-        points_m: (N, 3) in the target's frame, as drawn.
+        views: stations; every view shows all points, in the same order.
+        points_m: (N, 3) in the target's frame, as in its drawing.
         start: nominal values; `point_errors_m` is (N, 3) of zeros.
-        limit_m, limit_rad: the mount must come out at least this certain (one sigma, worst direction).
+        limit_m, limit_rad: largest accepted standard deviations of the mount, in its worst direction.
 
     Raises:
         InvalidRequest: too few views, wrong shapes or not finite.
-        NotObservable: the hand turned about one axis only, or the mount stays too uncertain; says what to add.
+        NotObservable: the hand rotated about one axis only, or the mount stays too uncertain; says what to add.
 
-    Source: the bundle of Tabb, Ahmad Yousef, Machine Vision and Applications 28, 2017, with priors.
+    Source: the bundle adjustment of Tabb, Ahmad Yousef, Machine Vision and Applications 28, 2017, with priors.
     """
     _check(views, points_m)
     used = list(range(len(views)))
@@ -144,7 +151,7 @@ def calibrate_in_hand(
             break
         del used[worst]
     rest = np.concatenate([_residual(views[k], points_m, state, known.disc_m)[0] for k in used])
-    # More scatter than was stated: then everything is as much less certain.
+    # Residuals larger than the stated noise explains make all parameters less certain, in proportion.
     covariance = minimum.covariance * max(1.0, minimum.chi_square / (len(rest) - 12))
     check_accuracy(covariance, len(used), limit_m=limit_m, limit_rad=limit_rad)
     return InHandCalibration(
@@ -168,15 +175,16 @@ def propose_view(
     done: Sequence[RigidTransform], candidates: Sequence[RigidTransform], points_m: Array, state: InHandState,
     known: Beforehand, *, sigma_px: float = 0.05,
 ) -> tuple[int, float]:  # fmt: skip
-    """Which flange pose to look from next: the one after which the mount is known best.
+    """Choose the next flange pose: the one after which the mount is known best.
 
     Args:
         done: base_from_flange of the stations so far.
         candidates: poses from which all points are in view.
-        state: what is believed now; nominal values will do.
+        state: current estimate; nominal values suffice.
         sigma_px: expected noise of a point.
 
-    Returns: index into `candidates`, and one sigma of the mount after it, m: of its place, with its turn at 0.1 m.
+    Returns: index into `candidates`, and the standard deviation of the mount with that pose in metres: of its position,
+        with rotations converted at a distance of `LEVER_M`.
 
     Raises:
         InvalidRequest: no candidates.
@@ -198,7 +206,7 @@ def propose_view(
 def _information(
     flange: RigidTransform, points_m: Array, state: InHandState, known: Beforehand, sigma_px: float
 ) -> Array:
-    """Information matrix that one view contributes to the state's step."""
+    """Return the information matrix that one view contributes about the step of the state."""
     nothing = np.zeros((len(points_m), 2))
     covariance = np.tile(sigma_px**2 * np.eye(2), (len(points_m), 1, 1))
     view = InHandView(base_from_flange=flange, pixels_px=nothing, covariance_px=covariance)
@@ -207,6 +215,11 @@ def _information(
 
 
 def _check(views: Sequence[InHandView], points_m: Array) -> None:
+    """Check number, shapes and values of the views.
+
+    Raises:
+        InvalidRequest: they are not usable.
+    """
     if len(views) < FEWEST_VIEWS:
         raise InvalidRequest(f"{len(views)} views; four are the least", hint="take twelve, turned about several axes")
     for k, view in enumerate(views):
@@ -219,10 +232,11 @@ def _check(views: Sequence[InHandView], points_m: Array) -> None:
 def _fit(
     views: Sequence[InHandView], points_m: Array, start: InHandState, known: Beforehand
 ) -> tuple[InHandState, Minimum]:
+    """Fit the state by weighted nonlinear least squares with priors."""
     priors = _priors(start.intrinsics, known, len(points_m))
     believed = parameters(start.intrinsics)[INDEX]
     state = start
-    for _ in range(2):  # the weights depend on the levers only; at the first answer they are exact enough
+    for _ in range(2):  # the weights depend only on levers; those of the first result are accurate enough
         whiten = [np.linalg.inv(np.linalg.cholesky(_noise(view, points_m, state, known))) for view in views]
 
         def linearise(at: InHandState, whiten: list[Array] = whiten) -> tuple[Array, Array]:
@@ -241,7 +255,7 @@ def _fit(
 
 
 def _priors(lens: CameraIntrinsics, known: Beforehand, count: int) -> Array:
-    """Standard deviations of the lens, of the points' coordinates and of their offset, in the order of the state's step."""
+    """Return prior standard deviations of lens, point coordinates and offset, in the order of the state's step."""
     of_lens = [
         known.focal_ratio * lens.fx_px,
         known.focal_ratio * lens.fy_px,
@@ -253,6 +267,7 @@ def _priors(lens: CameraIntrinsics, known: Beforehand, count: int) -> Array:
 
 
 def _moved(state: InHandState, step: Array) -> InHandState:
+    """Return the state after a step: mount (6), target (6), lens, point errors (3N) and offset (2)."""
     values = parameters(state.intrinsics)
     values[INDEX] += step[12 : 12 + len(FREE)]
     return InHandState(
@@ -265,7 +280,7 @@ def _moved(state: InHandState, step: Array) -> InHandState:
 
 
 def _residual(view: InHandView, points_m: Array, state: InHandState, disc_m: float) -> tuple[Array, Array]:
-    """(2N,) residuals, predicted minus measured pixels, and their derivatives with respect to the state's step."""
+    """Return the residuals (2N,), predicted minus measured pixels, and their Jacobian (2N, p) over the state's step."""
     Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
     Ra = matrix_of(view.base_from_flange)
     turned = (points_m + state.point_errors_m) @ Rz.T
@@ -284,7 +299,7 @@ def _residual(view: InHandView, points_m: Array, state: InHandState, disc_m: flo
     by_point = by_q @ camera_from_base @ Rz
     for k in range(n):
         J[k, :, 12 + len(FREE) + 3 * k :][:, :3] = by_point[k]
-    # Of some hundredths of a pixel: where exactly the camera stands changes nothing of them.
+    # The offsets are some hundredths of a pixel, so their derivatives with respect to the poses are neglected.
     camera_from_target = (view.base_from_flange * state.flange_from_camera).inv() * state.base_from_target
     J[:, :, -2] = disc_offset_px(points_m, disc_m, camera_from_target, state.intrinsics)
     J[:, :, -1] = tangent * np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -292,7 +307,7 @@ def _residual(view: InHandView, points_m: Array, state: InHandState, disc_m: flo
 
 
 def _noise(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> Array:
-    """(2N, 2N) covariance of a view's residuals: noise of the pixels, and the common effect of the arm's repeatability."""
+    """Return the covariance (2N, 2N) of a view's residuals: noise of the pixels, and the common effect of the arm."""
     Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
     Ra = matrix_of(view.base_from_flange)
     world = (points_m + state.point_errors_m) @ Rz.T + state.base_from_target.translation
@@ -312,5 +327,6 @@ def _noise(view: InHandView, points_m: Array, state: InHandState, known: Beforeh
 
 
 def _chi_square(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> float:
+    """Return the chi-square of one view."""
     r, _ = _residual(view, points_m, state, known.disc_m)
     return float(r @ np.linalg.solve(_noise(view, points_m, state, known), r))

@@ -1,7 +1,7 @@
-"""Camera intrinsics from views of known points: a board, or the panel's own lights.
+"""Camera intrinsics from views of known points, on a board or the panel's own lights.
 
-One function fits both lens models: the radial-tangential one by maximum likelihood over intrinsics and board poses,
-and, on top of it, the paper's bivariate cubic from measured to ideal pixel, which reports its bias.
+`calibrate_camera` fits two lens models: the radial-tangential one, by maximum likelihood over intrinsics and board
+poses, and the paper's bivariate cubic from measured to ideal pixel, for which it reports the bias.
 """
 
 from __future__ import annotations
@@ -23,23 +23,26 @@ from perception.calibration.cubic_lens import CubicLens, fit_cubic
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 BOARD_FREE = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")  # k3 needs points in the corners of a wide lens
-LIGHTS_FREE = ("fx", "fy", "cx", "cy", "k1")  # four points a view
-FOCAL_LIMIT = 0.01  # of the focal length
-CENTRE_LIMIT = 0.02  # of the image width
-STRAY = 6.0  # sigmas, or times the view's median error
+LIGHTS_FREE = ("fx", "fy", "cx", "cy", "k1")  # for four points per view
+FOCAL_LIMIT = 0.01  # largest accepted standard deviation, relative to the focal length
+CENTRE_LIMIT = 0.02  # largest accepted standard deviation, relative to the image width
+STRAY = 6.0  # outliers are beyond this multiple of sigma and of the view's median error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraCalibration:
-    """The fit.
+    """Result of a calibration of the intrinsics.
 
     Attributes:
         intrinsics: pinhole and radial-tangential lens.
         names, covariance: the parameters that were fitted, and their (n, n) covariance (px, or 1 for the lens).
-        rms_px: of all residuals (both coordinates together); residuals_px: one (N, 2) a view.
-        chi_square, degrees: with the stated noise of the points.
+        rms_px: root mean square of all residuals, both coordinates together.
+        residuals_px: (N, 2) per view.
+        chi_square, degrees: chi-square with the stated noise of the points, and degrees of freedom.
         board_poses: camera_from_board of every view.
-        cubic: the paper's correction, fitted to the same points; its bias is what it cannot follow over the frame.
+        cubic: the paper's correction, fitted to the same points; its bias is the part of the distortion over the image
+        that
+            it cannot represent.
         cubic_covariance: (10, 10) of one column of its coefficients, px^2.
     """
 
@@ -57,6 +60,8 @@ class CameraCalibration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _State:
+    """Intrinsics and board poses during the fit."""
+
     intrinsics: CameraIntrinsics
     poses: tuple[RigidTransform, ...]
 
@@ -65,17 +70,18 @@ def calibrate_camera(
     views: Sequence[BoardView], image_size_px: tuple[int, int], *, free: Sequence[str] = BOARD_FREE,
     start: CameraIntrinsics | None = None,
 ) -> CameraCalibration:  # fmt: skip
-    """Intrinsics, lens and board poses from three views or more.
+    """Estimate intrinsics, lens and board poses from three or more views.
 
     Args:
         views: known points in images; the boards must be flat unless `start` is given. `LIGHTS_FREE` suits four lights.
         image_size_px: (width, height).
-        free: which of `NAMES` to fit; the others stay at `start`, or 0 for the lens.
-        start: rough intrinsics; from the views themselves (Zhang) when None.
+        free: which of `NAMES` to fit; the others keep their value in `start`, or 0 for the lens.
+        start: rough intrinsics; if None, they are computed from the views (Zhang).
 
     Raises:
         InvalidRequest: too few views or points, unknown names, not finite.
-        NotObservable: the views are too alike, so that focal length or centre stays uncertain; tells how to add views.
+        NotObservable: the views are too similar, so that focal length or centre is uncertain; the hint says how to add
+            views.
 
     Source: Zhang, IEEE PAMI 22(11), 2000.
     """
@@ -83,7 +89,7 @@ def calibrate_camera(
     guess = start if start is not None else _zhang(views, image_size_px)
     poses = tuple(_first_pose(view, guess) for view in views)
     index = [NAMES.index(name) for name in NAMES if name in free]
-    # The lens starts straight; focal lengths and poses settle first, then everything moves.
+    # The first fit is without distortion, over focal lengths and poses only; the second is over all parameters.
     state = _State(intrinsics=guess, poses=poses)
     if start is None:
         state, _ = _fit(views, state, [i for i in index if i < 2])
@@ -92,7 +98,7 @@ def calibrate_camera(
     state, minimum = _fit(views, state, index)
     n = len(index)
     degrees = 2 * sum(len(view.points_m) for view in views) - n - 6 * len(views)
-    # More scatter than was stated: then everything is as much less certain.
+    # Residuals larger than the stated noise explains make all parameters less certain, in proportion.
     covariance = minimum.covariance[:n, :n] * max(1.0, minimum.chi_square / degrees)
     _check_accuracy(covariance, [NAMES[i] for i in index], state.intrinsics)
     residuals = tuple(
@@ -110,11 +116,11 @@ def calibrate_camera(
 
 
 def _cleaned(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> BoardView:
-    """The view without outlying points, and with the true middles of its discs."""
+    """Return the view without outlying points, and with the pixels of discs corrected to their true middles."""
     errors_px = np.linalg.norm(view.pixels_px - project(pose.apply(view.points_m), intrinsics), axis=1)
     near = errors_px <= STRAY * max(view.sigma_px, float(np.median(errors_px)))
     if near.sum() < FEWEST_POINTS:
-        near[:] = True  # four lights: nothing tells which of them is the stray
+        near[:] = True  # with four lights it is impossible to tell which one is the outlier
     points_m, pixels_px = view.points_m[near], view.pixels_px[near]
     if view.disc_m > 0.0:
         pixels_px = pixels_px - disc_offset_px(points_m, view.disc_m, pose, intrinsics)
@@ -122,6 +128,11 @@ def _cleaned(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics
 
 
 def _check(views: Sequence[BoardView], free: Sequence[str]) -> None:
+    """Check the views and the names of the parameters.
+
+    Raises:
+        InvalidRequest: they are not usable.
+    """
     unknown = set(free) - set(NAMES)
     if unknown:
         raise InvalidRequest(f"no parameter called {sorted(unknown)[0]!r}", hint=f"known: {', '.join(NAMES)}")
@@ -137,7 +148,7 @@ def _check(views: Sequence[BoardView], free: Sequence[str]) -> None:
 
 
 def _homography(view: BoardView) -> Array:
-    """Direct linear transform from board x, y to pixels, with Hartley's scaling."""
+    """Return the homography (3, 3) from board x, y to pixels, by direct linear transform with Hartley's scaling."""
     plane, pixels = view.points_m[:, :2], view.pixels_px
     Ta, Tb = _scaling(plane), _scaling(pixels)
     a = np.column_stack([plane, np.ones(len(plane))]) @ Ta.T
@@ -149,13 +160,14 @@ def _homography(view: BoardView) -> Array:
 
 
 def _scaling(points: Array) -> Array:
+    """Return the similarity (3, 3) that moves the centroid of points (N, 2) to zero and their mean square to one."""
     centre = points.mean(axis=0)
     size = float(np.sqrt(np.mean((points - centre) ** 2))) or 1.0
     return np.array([[1 / size, 0, -centre[0] / size], [0, 1 / size, -centre[1] / size], [0, 0, 1]])
 
 
 def _zhang(views: Sequence[BoardView], size: tuple[int, int]) -> CameraIntrinsics:
-    """Focal lengths from the homographies with the centre in the middle of the image.
+    """Compute focal lengths from the homographies, with the principal point in the middle of the image.
 
     With K^-1 H = (h1 h2 h3): h1 . h2 = 0 and |h1| = |h2| are linear in 1/fx^2 and 1/fy^2.
     """
@@ -169,7 +181,7 @@ def _zhang(views: Sequence[BoardView], size: tuple[int, int]) -> CameraIntrinsic
         rows += [[a1 * a2, b1 * b2], [a1**2 - a2**2, b1**2 - b2**2]]
         values += [-c1 * c2, c2**2 - c1**2]
     inverse = np.linalg.lstsq(np.array(rows) * width**-2, np.array(values), rcond=None)[0] * width**-2
-    focal = 1.2 * width * np.ones(2)  # a usual lens, where all views are frontal and the rows say nothing
+    focal = 1.2 * width * np.ones(2)  # a usual lens; frontal views do not determine the focal lengths
     if (inverse > 0).all():
         found = 1.0 / np.sqrt(inverse)
         focal = np.where((found > 0.3 * width) & (found < 8.0 * width), found, focal)
@@ -180,7 +192,7 @@ def _zhang(views: Sequence[BoardView], size: tuple[int, int]) -> CameraIntrinsic
 
 
 def _first_pose(view: BoardView, intrinsics: CameraIntrinsics) -> RigidTransform:
-    """camera_from_board from the homography of the undistorted pixels (flat), or by OpenCV's SQPNP (not flat)."""
+    """Return camera_from_board from the homography of the undistorted pixels (flat), else by OpenCV's SQPNP."""
     ideal = undistort_pixels(view.pixels_px, intrinsics)
     K = np.array([
         [intrinsics.fx_px, 0, intrinsics.cx_px], [0, intrinsics.fy_px, intrinsics.cy_px], [0, 0, 1.0]
@@ -202,14 +214,14 @@ def _first_pose(view: BoardView, intrinsics: CameraIntrinsics) -> RigidTransform
 
 
 def parameters(intrinsics: CameraIntrinsics) -> Array:
-    """(9,) values of `NAMES`."""
+    """Return the values (9,) of `NAMES`."""
     return np.array([
         intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px, *intrinsics.distortion
     ])  # fmt: skip
 
 
 def with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntrinsics:
-    """The lens with the nine values of `NAMES`."""
+    """Return the intrinsics with the values (9,) of `NAMES`."""
     fx, fy, cx, cy, *lens = (float(v) for v in values)
     return CameraIntrinsics(
         width_px=intrinsics.width_px, height_px=intrinsics.height_px, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy,
@@ -218,7 +230,7 @@ def with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntrin
 
 
 def lens_jacobian(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
-    """(N, 2, 9) derivatives of the pixels of (N, 2) undistorted normalised points with respect to `NAMES`."""
+    """Return the derivatives (N, 2, 9) of pixels with respect to `NAMES`, for undistorted normalised points (N, 2)."""
     x, y = normalised.T
     r2 = x * x + y * y
     d = distort(normalised, intrinsics)
@@ -235,7 +247,7 @@ def lens_jacobian(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
 
 
 def _projection(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> tuple[Array, Array, Array]:
-    """Pixels (N, 2), and derivatives (2N, 9) with respect to the intrinsics and (2N, 6) to the pose."""
+    """Return the pixels (N, 2) and their derivatives with respect to the intrinsics (2N, 9) and to the pose (2N, 6)."""
     turned = view.points_m @ matrix_of(pose).T
     q = turned + pose.translation
     z = np.maximum(q[:, 2], 1e-6)
@@ -254,6 +266,11 @@ def _projection(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrins
 
 
 def _fit(views: Sequence[BoardView], start: _State, index: list[int]) -> tuple[_State, Minimum]:
+    """Fit the parameters `index` of `NAMES` and all board poses by nonlinear least squares.
+
+    Raises:
+        NotObservable: the views do not determine them.
+    """
     n = len(index)
 
     def linearise(state: _State) -> tuple[Array, Array]:
@@ -285,6 +302,11 @@ HINT = "tilt the board (or the hand) by 20 to 40 degrees in several directions, 
 
 
 def _check_accuracy(covariance: Array, names: list[str], intrinsics: CameraIntrinsics) -> None:
+    """Check that focal lengths and principal point are certain enough.
+
+    Raises:
+        NotObservable: one of them is not.
+    """
     limits = {"fx": FOCAL_LIMIT * intrinsics.fx_px, "fy": FOCAL_LIMIT * intrinsics.fy_px,
               "cx": CENTRE_LIMIT * intrinsics.width_px, "cy": CENTRE_LIMIT * intrinsics.width_px}  # fmt: skip
     sigma = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))

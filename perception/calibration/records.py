@@ -1,4 +1,4 @@
-"""Calibration results as records: versioned, dated, with their quality; written as TOML that `hal` reads back."""
+"""Calibration results as records with version, date and quality figures, written as TOML that `hal` reads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from perception.calibration.wrench import WrenchCalibration
 
 
 def mount_of(parent_from_device: UncertainPose) -> MountRecord:
-    """Position, fixed-axis roll pitch yaw, one sigma per axis and the correlations of the axes' errors."""
+    """Return a mount: position, roll pitch yaw about fixed axes, and standard deviations with correlations."""
     pose, covariance = parent_from_device.parent_from_child, parent_from_device.covariance
     sigma = np.sqrt(np.diag(covariance))
     correlations = (covariance / np.outer(sigma, sigma))[np.tril_indices(6, -1)] if np.all(sigma > 0) else np.empty(0)
@@ -31,7 +31,7 @@ def record_of(
     *,
     date: str,
 ) -> CalibrationRecord:
-    """The record of one result, version 1.
+    """Return the record of one result, with version 1.
 
     Args:
         device: its name in the cell file.
@@ -62,7 +62,7 @@ def record_of(
 
 
 def renewed(current: CalibrationRecord, found: CalibrationRecord) -> CalibrationRecord:
-    """The present record updated with the new results, with its version incremented."""
+    """Return the present record updated with the new results, with its version incremented."""
     parts = {name: getattr(found, name) for name in ("mount", "intrinsics", "load")}
     update = {name: part for name, part in parts.items() if part is not None}
     about = {"date": found.date, "method": found.method, "quality": found.quality, "version": current.version + 1}
@@ -70,16 +70,17 @@ def renewed(current: CalibrationRecord, found: CalibrationRecord) -> Calibration
 
 
 def to_toml(record: CalibrationRecord, *, over: str | None = None) -> str:
-    """The record as a file has it: scalars first, then one table per part.
+    """Return the record as the text of a TOML file: scalars first, then one table per part.
 
     Args:
-        over: text of the file that it replaces, whose comments stay.
+        over: text of the file that is replaced; its comments are kept.
     """
     data = record.model_dump(mode="json", by_alias=True, exclude_none=True)
     return toml_text(data) if over is None else toml_edited(over, data)
 
 
 def _in_hand_record(device: str, result: InHandCalibration, date: str) -> CalibrationRecord:
+    """Return the record of a joint calibration of mount and lens."""
     i = result.intrinsics
     sigma = dict(zip(FREE, result.lens_sigma.tolist(), strict=True))
     mount = mount_of(result.flange_from_camera)
@@ -98,6 +99,7 @@ def _in_hand_record(device: str, result: InHandCalibration, date: str) -> Calibr
 
 
 def _camera_record(device: str, result: CameraCalibration, date: str) -> CalibrationRecord:
+    """Return the record of a calibration of the intrinsics."""
     i = result.intrinsics
     sigma = dict(zip(result.names, np.sqrt(np.diag(result.covariance)).tolist(), strict=True))
     quality = {f"sigma_{name}": value for name, value in sigma.items()}
@@ -113,5 +115,6 @@ def _camera_record(device: str, result: CameraCalibration, date: str) -> Calibra
 
 
 def _three(values: object) -> Vector3:
+    """Return three values as a tuple of floats."""
     x, y, z = (float(v) for v in np.asarray(values, float))
     return (x, y, z)

@@ -1,6 +1,6 @@
 """Calibration of the range scanner's mount: its points on one flat plate, seen from several poses, must be coplanar.
 
-It works for line scanners and for range cameras, because only points are used.
+It suits line scanners and range cameras, because it uses only points.
 """
 
 from __future__ import annotations
@@ -16,18 +16,21 @@ from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, matrix_of, perturbed
 from hal.least_squares import Minimum, descend
 
-LIMIT_M = 0.003
-LIMIT_RAD = 0.02
-OUTLIER_SIGMAS = 3.0  # further off the plate than that is something mounted on it, or a beam on two surfaces
-ROUNDS = 3
-LEAST_POINTS = 20
-ARM_SIGMA = (1e-4, 1e-4, 1e-4)  # m along the plate's normal, rad about its two axes: what the arm repeats to
+LIMIT_M = 0.003  # largest accepted standard deviation of the mount's position
+LIMIT_RAD = 0.02  # the same for its orientation
+OUTLIER_SIGMAS = 3.0  # points farther from the plate are on something mounted on it, or mix two surfaces
+ROUNDS = 3  # fits, with outliers removed after each
+LEAST_POINTS = 20  # least number of points that a scan keeps
+ARM_SIGMA = (1e-4, 1e-4, 1e-4)  # repeatability of the arm: m along the plate's normal, rad about its two axes
 NAMES = ("shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScannerView:
-    """One scan of the plate: the flange pose, points (N, 3) in scanner axes (m), noise along the rays (m), one or (N,)."""
+    """One scan of the plate: flange pose, points (N, 3) in scanner axes (m), and their noise along the rays (m).
+
+    The noise is one number, or one per point.
+    """
 
     base_from_flange: RigidTransform
     points_m: Array
@@ -36,7 +39,14 @@ class ScannerView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScannerCalibration:
-    """`flange_from_scanner` with covariance, chi-square and degrees of freedom, residual rms over all points (m)."""
+    """Result of the calibration of the scanner's mount.
+
+    Attributes:
+        flange_from_scanner: with covariance.
+        plane_base: the plate's unit normal n (3,) and offset d (n . X = d), base frame, m.
+        chi_square, degrees: chi-square of the fit and its degrees of freedom.
+        rms_m: root mean square distance of all points from the plate.
+    """
 
     flange_from_scanner: UncertainPose
     plane_base: tuple[Array, float]
@@ -48,11 +58,12 @@ class ScannerCalibration:
 def calibrate_scanner(
     views: Sequence[ScannerView], start: RigidTransform, base_from_plate: UncertainPose
 ) -> ScannerCalibration:
-    """The scanner's mount, and the plate's plane (its z axis, through its origin) refined along with it.
+    """Estimate the scanner's mount, and refine the plate's plane (z = 0 of the plate's frame) with it.
 
-    Minimises sum (n_i . (A_i Y p) - d_i)^2 / sigma^2 over Y = flange_from_scanner and the plane (n, d), the plane held
-    by the covariance of `base_from_plate`. Every scan meets the plane a little off, n_i and d_i, within what the arm
-    repeats to: thousands of points a scan would otherwise promise micrometres.
+    Minimises sum (n_i . (A_i Y p) - d_i)^2 / sigma^2 over Y = flange_from_scanner and the plane (n, d), with the
+    covariance of `base_from_plate` as prior of the plane. Every scan has its own plane n_i, d_i, which differs from (n,
+    d) by the repeatability of the arm. Otherwise thousands of points per scan would make the result seem accurate to
+    micrometres.
 
     Args:
         views: scans from several distances and tilts.
@@ -61,7 +72,7 @@ def calibrate_scanner(
 
     Raises:
         InvalidRequest: no views, wrong shapes or not finite.
-        NotObservable: the poses leave a direction of the mount free or too uncertain; the message names it.
+        NotObservable: a direction of the mount is not determined, or too uncertain; the message names it.
     """
     points = [_checked(k, view) for k, view in enumerate(views)]
     if not points:
@@ -80,7 +91,7 @@ def calibrate_scanner(
         scans = kept
     pose, bends = state
     degrees = sum(len(scan.points_m) for scan in scans) - 6
-    # More scatter than was stated: then everything is as much less certain.
+    # Residuals larger than the stated noise explains make all parameters less certain, in proportion.
     covariance = minimum.covariance[:6, :6] * max(1.0, minimum.chi_square / degrees)
     _check(covariance)
     frame, origin = matrix_of(base_from_plate.parent_from_child), base_from_plate.parent_from_child.translation
@@ -95,23 +106,23 @@ def calibrate_scanner(
 
 
 State = tuple[RigidTransform, Array]
-"""The scanner's mount, and bends (two tilts, rad, and a shift, m) of the plate, then of each scan against it."""
+"""The scanner's mount, and corrections (two tilts, rad, and a shift, m) of the plate, then of each scan against it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Scan:
-    """A scan with the noise (N,) of its points across the plate."""
+    """A scan with the standard deviations (N,) of its points normal to the plate."""
 
     base_from_flange: RigidTransform
     points_m: Array
     sigma_m: Array
 
     def rows(self, state: State, index: int, plate: UncertainPose) -> tuple[Array, Array, Array]:
-        """Heights (N,) over the plate as this scan meets it, and their derivatives (N, 6) by mount and (N, 3) by bends."""
+        """Return heights (N,) over the scan's own plane, and their derivatives by mount (N, 6) and plane (N, 3)."""
         pose, bends = state
         frame, origin = matrix_of(plate.parent_from_child), plate.parent_from_child.translation
         bend = bends[:3] + bends[3 + 3 * index : 6 + 3 * index]
-        n = frame[:, 2] + frame[:, :2] @ bend[:2]  # its length grows by the square of milliradians
+        n = frame[:, 2] + frame[:, :2] @ bend[:2]  # of length 1 up to the square of milliradians
         Ra = matrix_of(self.base_from_flange)
         turned = self.points_m @ matrix_of(pose).T
         world = (turned + pose.translation) @ Ra.T + self.base_from_flange.translation - origin
@@ -120,11 +131,11 @@ class _Scan:
         return world @ n - bend[2], by_pose, by_bend
 
     def heights(self, state: State, index: int, plate: UncertainPose) -> Array:
-        """(N,) over the plate, m."""
+        """Return the heights (N,) of the points over the plate, m."""
         return self.rows(state, index, plate)[0]
 
     def within(self, sigmas: float, state: State, index: int, plate: UncertainPose) -> _Scan:
-        """The scan without points that do not belong to the plate."""
+        """Return the scan without points farther than `sigmas` from the plate; unchanged if too few would remain."""
         near = np.abs(self.heights(state, index, plate)) < sigmas * self.sigma_m
         if near.sum() < LEAST_POINTS:
             return self
@@ -132,6 +143,7 @@ class _Scan:
 
 
 def _fit(scans: Sequence[_Scan], start: State, plate: UncertainPose) -> tuple[State, Minimum]:
+    """Fit mount and corrections by weighted nonlinear least squares, with priors on the corrections."""
     loose = np.diag(1.0 / np.array(ARM_SIGMA)[[1, 2, 0]])
     count = 9 + 3 * len(scans)
     held = np.zeros((3 + 3 * len(scans), count))
@@ -152,6 +164,11 @@ def _fit(scans: Sequence[_Scan], start: State, plate: UncertainPose) -> tuple[St
 
 
 def _checked(index: int, view: ScannerView) -> Array:
+    """Return the points of a view as an array.
+
+    Raises:
+        InvalidRequest: they are not usable.
+    """
     points = np.asarray(view.points_m, float)
     if (
         points.ndim != 2
@@ -167,17 +184,17 @@ def _checked(index: int, view: ScannerView) -> Array:
 
 
 def _across(view: ScannerView, points: Array, R: Array, normal: Array) -> Array:
-    """(N,) standard deviation of the points normal to the plate: that along the ray times the cosine of incidence."""
+    """Return the standard deviations (N,) normal to the plate: those along the rays times the cosine of incidence."""
     world = points @ (matrix_of(view.base_from_flange) @ R).T
     cosine = np.abs(world @ normal) / np.maximum(np.linalg.norm(points, axis=1), 1e-9)
     return np.asarray(view.sigma_m * np.maximum(cosine, 0.1))
 
 
 def _plane_prior(plate: UncertainPose) -> Array:
-    """Square root information of (bend 1, bend 2, shift at its origin), from the plate's 6x6 covariance."""
+    """Return the square-root information (3, 3) of the plate's two tilts and shift, from its 6x6 covariance."""
     R = matrix_of(plate.parent_from_child)
     n, e1, e2 = R[:, 2], R[:, 0], R[:, 1]
-    # A turn r moves n by r x n: bend1 = e1 . (r x n) = r . (n x e1) = r . e2, bend2 = -r . e1; the shift is n . t.
+    # A rotation r changes n by r x n: tilt 1 = e1 . (r x n) = r . (n x e1) = r . e2, tilt 2 = -r . e1, shift = n . t.
     J = np.zeros((3, 6))
     J[0, 3:], J[1, 3:] = e2, -e1
     J[2, :3] = n
@@ -186,6 +203,11 @@ def _plane_prior(plate: UncertainPose) -> Array:
 
 
 def _check(covariance: Array) -> None:
+    """Check that the covariance of the mount is within the limits.
+
+    Raises:
+        NotObservable: a direction is too uncertain.
+    """
     sigma = np.sqrt(np.diag(covariance))
     limits = np.array([LIMIT_M] * 3 + [LIMIT_RAD] * 3)
     worst = int(np.argmax(sigma / limits))

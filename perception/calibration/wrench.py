@@ -1,4 +1,4 @@
-"""Force/torque bias and tool weight from readings without contact in several poses of the hand."""
+"""Calibration of force/torque bias and tool weight from readings without contact in several poses of the hand."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import skew
 
 GRAVITY_M_PER_S2 = 9.80665
-LEAST_SPREAD = 0.02  # mean square of gravity's direction along its second axis, after its mean: 8 degrees of tilt
-LIMIT_KG = 0.05
+# Mean square of gravity's direction along its second principal axis, about its mean: 8 degrees of tilt.
+LEAST_SPREAD = 0.02
+LIMIT_KG = 0.05  # largest accepted standard deviation of the mass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WrenchCalibration:
-    """What hangs below the sensor.
+    """Bias of the sensor and weight of the tool below it.
 
     Attributes:
         load: mass, centre of mass and bias, sensor axes.
         covariance: 10x10 over force bias (N), mass (kg), torque bias (N m), mass times centre (kg m).
-        rms_n, rms_nm: what remains of the readings.
+        rms_n, rms_nm: root mean square residuals of force and torque.
     """
 
     load: ToolLoad
@@ -36,15 +37,17 @@ class WrenchCalibration:
 def calibrate_wrench(
     base_from_sensor: ArrayLike, wrenches: ArrayLike, *, gravity_base: ArrayLike = (0.0, 0.0, -GRAVITY_M_PER_S2)
 ) -> WrenchCalibration:
-    """Bias and weight from f_i = b_f + m g_i, t_i = b_t + c x (m g_i), with g_i the gravity in sensor axes; linear.
+    """Estimate bias and weight from f_i = b_f + m g_i, t_i = b_t + c x (m g_i), with g_i the gravity in sensor axes.
+
+    Both equations are linear in b_f, m, b_t and m c.
 
     Args:
         base_from_sensor: (N, 3, 3) rotations of the sensor; N >= 4, hand at rest.
-        wrenches: (N, 6) readings fx fy fz (N) tx ty tz (N m), the load's pull on the sensor, sensor axes.
+        wrenches: (N, 6) readings fx fy fz (N) tx ty tz (N m): the wrench of the load on the sensor, sensor axes.
         gravity_base: (3,) m/s^2.
 
     Raises:
-        InvalidRequest: shapes, or not finite.
+        InvalidRequest: wrong shapes, or not finite.
         NotObservable: gravity came from too few directions; `details["next_down"]` is the direction (sensor axes) that
             should point down next.
     """
@@ -76,7 +79,7 @@ def calibrate_wrench(
 
 
 def unload(wrench: ArrayLike, base_from_sensor: ArrayLike, load: ToolLoad) -> Array:
-    """(6,) external wrench on the tool: the reading without bias and weight."""
+    """Return the external wrench (6,) on the tool: the reading minus bias and weight."""
     g = np.asarray(base_from_sensor, float).T @ np.array([0.0, 0.0, -GRAVITY_M_PER_S2])
     weight = load.mass_kg * g
     own = np.concatenate([weight, np.cross(load.centre_of_mass_m, weight)]) + load.bias
@@ -84,6 +87,11 @@ def unload(wrench: ArrayLike, base_from_sensor: ArrayLike, load: ToolLoad) -> Ar
 
 
 def _checked(base_from_sensor: ArrayLike, wrenches: ArrayLike, gravity_base: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return the arguments of `calibrate_wrench` as arrays.
+
+    Raises:
+        InvalidRequest: they are not usable.
+    """
     R, w, g = (np.asarray(a, float) for a in (base_from_sensor, wrenches, gravity_base))
     if R.ndim != 3 or R.shape[1:] != (3, 3) or w.shape != (len(R), 6) or g.shape != (3,) or len(R) < 4:
         raise InvalidRequest(
@@ -98,10 +106,15 @@ def _checked(base_from_sensor: ArrayLike, wrenches: ArrayLike, gravity_base: Arr
 
 
 def _check_directions(down: Array) -> None:
+    """Check that gravity, as directions (N, 3) in sensor axes, varied enough to separate weight from bias.
+
+    Raises:
+        NotObservable: it did not.
+    """
     centred = down - down.mean(axis=0)
     values, vectors = np.linalg.eigh(centred.T @ centred / len(down))
     if values[1] < LEAST_SPREAD:
-        # Across the mean direction, and across the direction in which it varied if it varied at all.
+        # Perpendicular to the mean direction, and to the direction in which it varied, if it varied.
         mean = down.mean(axis=0)
         weak = np.cross(mean, vectors[:, 2] if values[2] >= LEAST_SPREAD else np.eye(3)[int(np.argmin(np.abs(mean)))])
         weak /= np.linalg.norm(weak)
@@ -114,6 +127,7 @@ def _check_directions(down: Array) -> None:
 
 
 def _solve(rows: Array, values: Array) -> tuple[Array, Array, float]:
+    """Solve a linear least-squares problem; returns solution, covariance and root mean square residual."""
     solution = np.linalg.lstsq(rows, values, rcond=None)[0]
     rest = values - rows @ solution
     variance = float(rest @ rest) / max(len(values) - rows.shape[1], 1)

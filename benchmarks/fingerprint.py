@@ -26,12 +26,12 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 SEEDS = (1, 2, 3)
 TIMES = frozenset({"ms", "milliseconds", "seconds", "time_s", "took_s", "wall_s"})
-DIGITS = 9  # kept of a number: what differs beyond is the order of a sum, not an answer
+DIGITS = 9  # significant digits kept; differences beyond come from the order of a sum
 MISSION_PARTS = ("actions", "readings", "fused", "cell_s", "peak_force_n", "judge")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the fingerprints; return 1 when one differs from the reference's."""
+    """Write the fingerprints; return 1 if one differs from the reference's."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--against", type=Path)
@@ -53,14 +53,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def entry(answer: Any) -> dict[str, Any]:
-    """One answer with its fingerprint."""
+    """Return an answer with its fingerprint."""
     plain = without_times(answer)
     text = json.dumps(plain, sort_keys=True)
     return {"sha256": hashlib.sha256(text.encode()).hexdigest(), "answer": plain}
 
 
 def without_times(value: Any) -> Any:
-    """The same JSON value without what a clock on the wall measured, numbers rounded to `DIGITS` significant digits."""
+    """Return the JSON value without measured times, with numbers rounded to `DIGITS` significant digits."""
     if isinstance(value, dict):
         return {key: without_times(part) for key, part in value.items() if key not in TIMES}
     if isinstance(value, list):
@@ -69,7 +69,7 @@ def without_times(value: Any) -> Any:
 
 
 def missions(folder: Path) -> dict[str, Any]:
-    """What missions 1-3 read, did and fused on the bench cell, and the judge's verdict."""
+    """Return the readings, actions and fusion results of missions 1-3 on the bench cell, and the judge's verdicts."""
     out: dict[str, Any] = {}
     for seed in SEEDS:
         runs = folder / f"mission{seed}"
@@ -81,17 +81,17 @@ def missions(folder: Path) -> dict[str, Any]:
 
 
 def fusion(folder: Path) -> dict[str, Any]:
-    """The solutions of the nine-class development cases."""
+    """Return the solutions of the nine-class development cases."""
     return {"fusion": _answers("benchmarks.fusion", DATA / "fusion" / "dev_cases.json", folder / "fusion.json")}
 
 
 def pose(folder: Path) -> dict[str, Any]:
-    """The solutions of the four-light development problems."""
+    """Return the solutions of the four-light development problems."""
     return {"pose": _answers("benchmarks.pose", DATA / "pose" / "dev_quads.json", folder / "pose.json")}
 
 
 def vision(folder: Path) -> dict[str, Any]:
-    """The answers to the drawn and the photographed development images."""
+    """Return the answers to the drawn and the photographed development images."""
     out: dict[str, Any] = {}
     for images in ("synth_dev", "real"):
         jobs = folder / f"{images}-jobs.json"
@@ -103,7 +103,7 @@ def vision(folder: Path) -> dict[str, Any]:
 
 
 def ranges(folder: Path) -> dict[str, Any]:
-    """The labels and surfaces of the synthetic and the real development scenes."""
+    """Return the labels and surfaces of the synthetic and the real development scenes."""
     out: dict[str, Any] = {}
     for scenes in ("synthetic", "real"):
         answers = folder / f"range-{scenes}"

@@ -34,14 +34,14 @@ from fusion.solve import solve
 from hal.arrays import Array
 from hal.geometry import difference, matrix_of, perturbed, transform
 
-ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # the case files put rotation first, the cell translation
+ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # the case files put rotation first, the product translation
 
 
 # --- case files ------------------------------------------------------------------------------------------------------
 
 
 def measurement_of(value: dict[str, Any]) -> Measurement:
-    """One measurement of a case file; reads neither `outlier` nor anything else that a solver must not know."""
+    """Return a measurement of a case file, without `outlier` and anything else that a solver must not know."""
     return Measurement(
         cls=SensingClass.named(value["cls"]),
         x_m=np.array(value["x"], float),
@@ -61,7 +61,7 @@ def _symmetric(upper: Sequence[float]) -> Array:
 
 
 def solution(case: dict[str, Any], *, timed: bool) -> dict[str, Any] | None:
-    """The answer to one case in the scorer's schema (rotation first), or None where fusion refuses."""
+    """Return the solution of one case in the scorer's schema (rotation first), or None if fusion refuses."""
     measurements = [measurement_of(m) for m in case["measurements"]]
     started_s = time.process_time()
     try:
@@ -80,7 +80,7 @@ def solution(case: dict[str, Any], *, timed: bool) -> dict[str, Any] | None:
         ],
         "unobservable": [free.words for free in answer.unobservable],
     }
-    # Exactness is judged at the true pose, which a case file gives for that purpose alone.
+    # Exactness is judged at the true pose, which the case file contains for this purpose only.
     if "R_true" in case:
         made["f"] = local_values(measurements, transform(case["R_true"], case["t_true"])).tolist()
     return made | {"ms": ms} if timed else made
@@ -100,7 +100,7 @@ def solve_file(cases_file: Path, out_file: Path, *, timed: bool) -> None:
 
 
 def exactness(per_class: int, rng: np.random.Generator) -> Iterator[Row]:
-    """Largest relative difference from brute force for random SPD C and PSD M, over all nine classes."""
+    """Yield the largest relative difference from brute force for random SPD C and PSD M, over all nine classes."""
     kinds = {"plain": "condition up to 1e3", "wide": "condition up to 1e6", "flat": "rank-one M"}
     for kind, words in kinds.items():
         worst = 0.0
@@ -108,12 +108,12 @@ def exactness(per_class: int, rng: np.random.Generator) -> Iterator[Row]:
             for _ in range(per_class):
                 m, pose = random_measurement(cls, rng, kind=kind), transform(rotation(rng), rng.normal(0, 0.3, 3))
                 f = brute_force(m, pose)
-                worst = max(worst, (local_value(m, pose) - f) / (1e-3 + f))  # below it, brute force is the poorer one
+                worst = max(worst, (local_value(m, pose) - f) / (1e-3 + f))  # negative: brute force was less accurate
         yield f"nine local pose functions above brute force, {words}", "<= 1e-6", f"{worst:.1e}"
 
 
 def consistency(problems: int, rng: np.random.Generator) -> list[Row]:
-    """Efficiency and consistency without mismatches: N = 16, N = 10, and N = 12 with condition 100."""
+    """Measure efficiency and consistency without mismatches: N = 16, N = 10, and N = 12 with condition number 100."""
     rows: list[Row] = []
     for name, count, anisotropy in (("N=16", 16, 1.0), ("N=10", 10, 1.0), ("N=12, cond(C) = 100", 12, 100.0)):
         t = mixed(count, 0, problems, rng, anisotropy=anisotropy)
@@ -128,7 +128,7 @@ def consistency(problems: int, rng: np.random.Generator) -> list[Row]:
 
 
 def mismatches(problems: int, rng: np.random.Generator) -> list[Row]:
-    """Success, recall and false rejection with mismatched measurements; and what all-bad sets do."""
+    """Measure success, recall and false rejection with mismatched measurements, and the results of all-bad sets."""
     limits = {(16, 1): "100 %", (16, 4): "99 %", (16, 8): "97 %", (24, 12): "99 %", (40, 28): "85 %"}
     rows: list[Row] = []
     half = Tally()
@@ -149,7 +149,7 @@ def mismatches(problems: int, rng: np.random.Generator) -> list[Row]:
 
 
 def table_ii(runs: int, rng: np.random.Generator) -> list[Row]:
-    """The paper's sequence with its first measurement mismatched."""
+    """Solve the paper's sequence with its first measurement mismatched."""
     last, named_from = [], []
     for _ in range(runs):
         made = problem(TABLE_II, rng, bad=[0])
@@ -175,7 +175,7 @@ def table_ii(runs: int, rng: np.random.Generator) -> list[Row]:
 
 
 def certificates(problems: int, rng: np.random.Generator) -> list[Row]:
-    """How often the relaxation of a problem without mismatches is a pose, and what it costs."""
+    """Measure how often the relaxation of a problem without mismatches yields a pose, and its time."""
     tight, ms = 0, []
     for _ in range(problems):
         made = problem(codes(rng, 16), rng)
@@ -191,7 +191,7 @@ def certificates(problems: int, rng: np.random.Generator) -> list[Row]:
 
 
 def clock(rng: np.random.Generator) -> list[Row]:
-    """Medians over problems with N = 16, from measurement objects to answer."""
+    """Measure median times over problems with N = 16, from measurement objects to the answer."""
     made = [problem(codes(rng, 16), rng) for _ in range(100)]
     starts = [perturbed(p.base_from_object, rng.normal(0, 0.02, 6)) for p in made]
     local = _times_ms(lambda k: solve(made[k].measurements, starts[k]), 100)
@@ -215,7 +215,7 @@ def _times_ms(run: Callable[[int], object], count: int) -> list[float]:
 
 
 def large_and_proven(rng: np.random.Generator, problems: int) -> Iterator[Row]:
-    """Ten thousand measurements, and branch and bound over which of 16 to believe."""
+    """Measure ten thousand measurements, and branch and bound over which of 16 measurements are inliers."""
     many = problem(codes(rng, 10_000), rng, bad=1000)
     answer, s = _timed_s(partial(fuse, many.measurements))
     delta = difference(many.base_from_object, answer.pose)
@@ -238,7 +238,7 @@ def _timed_s(run: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def table(*, quick: bool) -> Iterator[Row]:
-    """Rows of (what, pass line, measured), as they come; times are the processor's."""
+    """Yield rows of (what, pass line, measured); times are CPU times."""
     rng = np.random.default_rng(20)
     warm_up()
     yield from exactness(1 if quick else 2, rng)
@@ -252,7 +252,7 @@ def table(*, quick: bool) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path, nargs="?")
     parser.add_argument("out", type=Path, nargs="?")

@@ -1,4 +1,4 @@
-"""What others make of the same measurements: least squares over all of them, and gtsam on the same rows."""
+"""Other methods on the same measurements: plain least squares over all of them, and gtsam on the same residuals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Row = tuple[str, str, str]
 
 
 def peers(problems: int, rng: np.random.Generator) -> list[Row]:
-    """Plain least squares with one bad measurement (the 1990 objective), and gtsam on the same rows."""
+    """Compare with plain least squares with one bad measurement (the 1990 objective) and with gtsam."""
     near = sum(
         is_near(difference(p.base_from_object, solve_from_many(p.measurements, starts=32).base_from_object))
         for p in (problem(codes(rng, 16), rng, bad=1) for _ in range(problems))

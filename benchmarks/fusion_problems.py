@@ -1,4 +1,4 @@
-"""Random fusion problems, and what the fusion makes of a family of them."""
+"""Random fusion problems, and statistics of the fusion over families of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NEAR_M, NEAR_RAD = 0.005, np.radians(1.0)
 
 @dataclass(kw_only=True)
 class Tally:
-    """What a family of simulated problems came to."""
+    """Statistics over a family of simulated problems."""
 
     count: int = 0
     near: int = 0
@@ -35,7 +35,7 @@ class Tally:
     ms: list[float] = field(default_factory=list)
 
     def add(self, made: Problem) -> FusedPose | None:
-        """Solve one problem and count."""
+        """Solve one problem and add its result to the statistics."""
         self.count += 1
         started_s = time.process_time()
         try:
@@ -59,12 +59,12 @@ class Tally:
 
 
 def is_near(delta: Array) -> bool:
-    """Success as the scorer counts it: 5 mm and 1 degree. `delta`: (6,) m and rad."""
+    """Return whether an error `delta` (6,), m and rad, is a success for the scorer: within 5 mm and 1 degree."""
     return bool(np.linalg.norm(delta[:3]) < NEAR_M and np.linalg.norm(delta[3:]) < NEAR_RAD)
 
 
 def codes(rng: np.random.Generator, count: int) -> list[str]:
-    """Random kinds of sensing."""
+    """Return random kinds of sensing."""
     return [CODES[k] for k in rng.integers(len(CODES), size=count)]
 
 
@@ -77,7 +77,11 @@ def mixed(count: int, bad: int, problems: int, rng: np.random.Generator, *, anis
 
 
 def random_measurement(cls: SensingClass, rng: np.random.Generator, *, kind: str = "plain") -> Measurement:
-    """Any feature, place, SPD C and rank-two M over three decades; `wide`: over six; `flat`: one direction error unknown."""
+    """Return a random measurement: any feature and position, SPD C and rank-two M over three decades.
+
+    Args:
+        kind: `plain`; `wide` for six decades; `flat` for no information about one direction error.
+    """
     A, B = rotation(rng), rotation(rng)
     decades = 2.0 if kind == "wide" else 1.0
     C = A @ np.diag(np.exp(-2.3 - decades * rng.uniform(0.0, 6.9, 3))) @ A.T
@@ -91,10 +95,10 @@ def random_measurement(cls: SensingClass, rng: np.random.Generator, *, kind: str
 
 
 def rotation(rng: np.random.Generator) -> Array:
-    """(3, 3) any rotation."""
+    """Return a random (3, 3) rotation."""
     return np.asarray(Rotation.random(rng=rng).as_matrix())
 
 
 def mismatched(answer: FusedPose) -> list[int]:
-    """Indices of the measurements judged bad."""
+    """Return the indices of the measurements that were rejected."""
     return [r.index for r in answer.rejected if r.reason == "mismatch" and r.index >= 0]

@@ -1,4 +1,4 @@
-"""Slow and plain versions of the fast loops, to check them by: brute force, and the table of rows in numpy.
+"""Slow and simple versions of the fast loops, to check them: brute force, and the table of residuals in numpy.
 
 Nothing here shares code with `exact`, `rows` or `fusion.solve.polish`.
 """
@@ -15,14 +15,14 @@ from fusion.measurement import Measurement, SensingClass
 from hal.arrays import Array
 from hal.geometry import matrix_of
 
-SPHERE = 1500  # directions of the first look
+SPHERE = 1500  # directions of the initial search
 REFINED = 3
 
 
 def brute_force(m: Measurement, base_from_object: RigidTransform) -> float:
-    """The local pose function by search: min over every allowed direction v of the best place's share plus v^T M v.
+    """Return the local pose function by search: the minimum over allowed directions v of position cost plus v^T M v.
 
-    For a given v the allowed places are a line or a plane, and the nearest one in C's metric is a linear problem.
+    For a given v the allowed positions are a line or a plane, and the nearest one in C's metric is a linear problem.
     """
     R = matrix_of(base_from_object)
     e, u = R @ m.x_m + base_from_object.translation - m.mu_m, R @ m.u
@@ -35,7 +35,7 @@ def brute_force(m: Measurement, base_from_object: RigidTransform) -> float:
     A = np.linalg.inv(m.C_m2)
 
     def share(v: Array) -> Array:
-        """Of the place, for rows of unit directions v (k, 3)."""
+        """Return the position cost for rows of unit directions v (k, 3)."""
         if fixed is not None:
             return np.full(len(v), fixed)
         if m.cls == SensingClass.LINE_POINT:
@@ -50,7 +50,7 @@ def brute_force(m: Measurement, base_from_object: RigidTransform) -> float:
 
     looks = _directions(basis.shape[1])
     best = looks[np.argsort(f(looks))[:REFINED]]
-    # The measured direction, and the limits where only one of the two shares counts, have narrow valleys.
+    # The cost has narrow valleys at the measured direction and where only one of its two parts matters.
     d = np.linalg.eigh(m.M)[1][:, 0]
     narrow = [d, e, *_across(e).T, d - e * (d @ e) / max(e @ e, 1e-300)]
     starts = [*best, *(basis.T @ v for v in narrow if np.linalg.norm(basis.T @ v) > 1e-9)]
@@ -58,13 +58,16 @@ def brute_force(m: Measurement, base_from_object: RigidTransform) -> float:
 
 
 def tilt(M: Array, v: Array) -> Array:
-    """v^T M v for rows of v (k, 3), as a sum of squares: the plain product loses what is below 1e-16 of M's largest entry."""
+    """Return v^T M v for rows of v (k, 3), computed as a sum of squares.
+
+    The plain product would lose values below 1e-16 of M's largest entry.
+    """
     values, vectors = np.linalg.eigh(M)
     return np.asarray((v @ vectors) ** 2 @ values)
 
 
 def _descended(f: Callable[[Array], float], start: Array) -> float:
-    """Nelder-Mead from a start, restarted small: no derivative that could share a mistake with the fast code."""
+    """Minimise by restarted Nelder-Mead, whose lack of derivatives excludes errors in common with the fast code."""
     x = start / np.linalg.norm(start)
     for size in (0.03, 1e-4, 1e-7):
         simplex = np.vstack([x, x + size * np.eye(len(x))])
@@ -75,7 +78,7 @@ def _descended(f: Callable[[Array], float], start: Array) -> float:
 
 
 def _nearest(m: Measurement, e: Array, u: Array) -> float:
-    """min over y of (y - mu)^T C^-1 (y - mu), with x - mu = e, for the classes whose places do not depend on v."""
+    """Return min over y of (y - mu)^T C^-1 (y - mu), x - mu = e, for the classes whose positions do not depend on v."""
     A = np.linalg.inv(m.C_m2)
     free = {1: np.empty((3, 0)), 2: u[:, None], 5: u[:, None], 3: _across(u), 6: _across(u), 9: _across(u)}[int(m.cls)]
     y: Array = e
@@ -85,12 +88,12 @@ def _nearest(m: Measurement, e: Array, u: Array) -> float:
 
 
 def _across(u: Array) -> Array:
-    """(3, 2) orthonormal basis across u."""
+    """Return a (3, 2) orthonormal basis perpendicular to u."""
     return np.asarray(np.linalg.svd(u[None])[2][1:].T)
 
 
 def _directions(dimension: int) -> Array:
-    """Unit vectors spread over half a circle or half a sphere (Fibonacci)."""
+    """Return unit vectors spread over half a circle or half a sphere (Fibonacci)."""
     k = np.arange(SPHERE) + 0.5
     if dimension == 2:
         angle = np.pi * k / SPHERE
@@ -101,7 +104,7 @@ def _directions(dimension: int) -> Array:
 
 
 def residual(m: Measurement, R: Array, t: Array) -> Array:
-    """Whitened first-order rows of one measurement at a pose, (1 to 4,): |residual|^2 is f. The table of notes/fusion.md."""
+    """Return the whitened first-order residuals of one measurement at a pose, (1 to 4,); their squared norm is f."""
     e, u, C = R @ m.x_m + t - m.mu_m, R @ m.u, m.C_m2
     if m.cls == SensingClass.POINT_POINT:
         return _white(e, C)

@@ -1,6 +1,6 @@
-"""Problems with a known answer: a panel with a block on it, sensed by four senses with honest noise and some mismatches.
+"""Simulated fusion problems: a panel with a block, measured by four senses with realistic noise and some mismatches.
 
-Planning, tests, examples and benchmarks draw from here. Noise levels are those of data/fusion/README.md.
+Planning, tests, examples and benchmarks use it. Noise levels are those of data/fusion/README.md.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ LINE_SIGMA_RAD = {
 PLANE_SIGMA_RAD = {"t": 0.002, "p": 0.010, "r": math.radians(0.3)}
 SENSED = {"1": Kind.POINT, "2": Kind.POINT, "3": Kind.POINT, "4": Kind.LINE, "5": Kind.LINE, "6": Kind.LINE,
           "7": Kind.PLANE, "8": Kind.PLANE, "9": Kind.PLANE}  # fmt: skip
-MISMATCH_F = 100.0  # a "mismatched" feature that the true pose explains to within this is no mismatch
+MISMATCH_F = 100.0  # a wrong feature whose cost at the true pose is lower does not count as a mismatch
 
 
 def panel() -> tuple[Feature, ...]:
-    """A 0.8 x 0.5 x 0.1 m panel, front at z = 0, with a block, a sloped face and six lights."""
+    """Return the features of a 0.8 x 0.5 x 0.1 m panel, front at z = 0, with a block, a sloped face and six lights."""
     body = box_features((0, 0, -0.1), (0.8, 0.5, 0), name="panel")
     block = [f for f in box_features((0.1, 0.1, 0), (0.35, 0.3, 0.06), name="block") if f.point_m[2] > 0]
     lights = [point((x, y, 0), name=f"light {x:.2f} {y:.2f}") for x in (0.05, 0.4, 0.75) for y in (0.05, 0.45)]
@@ -54,7 +54,7 @@ class Problem:
 
 
 def random_pose(rng: np.random.Generator) -> RigidTransform:
-    """Any orientation, about a metre before the base."""
+    """Return a pose with random orientation, about a metre in front of the base."""
     return transform(Rotation.random(rng=rng).as_matrix(), rng.uniform([0.8, -0.4, 0.4], [1.6, 0.4, 1.2]))
 
 
@@ -66,14 +66,14 @@ def problem(
     anisotropy: float = 1.0,
     features: Sequence[Feature] | None = None,
 ) -> Problem:
-    """One measurement per code, each of a random feature of the right kind; some of them mismatched.
+    """Return a problem with one measurement per code, each of a random feature of the right kind; some are mismatched.
 
     Args:
         codes: entries of `CODES`.
-        rng: source of pose, features, mismatches and noise.
-        bad: how many (random) or which indices claim to be another feature than the one sensed.
-        anisotropy: condition number of random point covariances; 1 keeps those of the sense.
-        features: the object, `panel()` by default.
+        rng: random generator for pose, features, mismatches and noise.
+        bad: how many measurements, or which ones by index, are attributed to a wrong feature.
+        anisotropy: condition number of random point covariances; 1 for the covariances of the sense.
+        features: features of the object; by default `panel()`.
     """
     things = panel() if features is None else tuple(features)
     pose = random_pose(rng)
@@ -104,7 +104,7 @@ def sense(
     claimed: Feature | None = None,
     anisotropy: float = 1.0,
 ) -> Measurement:
-    """A noisy measurement of kind `code` of the feature `actual`, filed under `claimed` (by default the same)."""
+    """Return a noisy measurement of kind `code` of `actual`, attributed to `claimed` (by default the same feature)."""
     R, t = matrix_of(base_from_object), base_from_object.translation
     x, u = R @ actual.point_m + t, R @ actual.direction
     sensed, sense_letter = SENSED[code[0]], code[1]
@@ -121,7 +121,7 @@ def sense(
 def _by_contact(
     sensed: Kind, kind: Kind, sense_letter: str, x: Array, u: Array, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """Where and with what covariance touch, proximity or range sensing finds a feature; the place itself without noise."""
+    """Return mu without noise, C and M of touch, proximity or range sensing of a feature."""
     along = _on_feature(kind, u, rng)
     C = POINT_SIGMA_M[sense_letter] ** 2 * np.eye(3)
     if sensed == Kind.POINT:
@@ -135,7 +135,7 @@ def _by_contact(
 
 
 def _on_feature(kind: Kind, u: Array, rng: np.random.Generator) -> Array:
-    """A random shift that stays on the feature."""
+    """Return a random shift along the feature."""
     if kind == Kind.POINT:
         return np.zeros(3)
     if kind == Kind.LINE:
@@ -144,7 +144,7 @@ def _on_feature(kind: Kind, u: Array, rng: np.random.Generator) -> Array:
 
 
 def _sensed_direction(sensed: Kind, kind: Kind, u: Array, rng: np.random.Generator) -> Array:
-    """The true direction of what is sensed: the feature's own, or any one that the constraint allows."""
+    """Return the true direction of what is sensed: the feature's own, or a random one that the constraint allows."""
     if sensed == kind:
         return u
     if kind == Kind.POINT:
@@ -153,7 +153,7 @@ def _sensed_direction(sensed: Kind, kind: Kind, u: Array, rng: np.random.Generat
 
 
 def _by_camera(cls: str, x: Array, u: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """One or two cameras 0.8 to 1.3 m away: mu, C and M, without the noise of mu."""
+    """Return mu, C and M of one or two cameras 0.8 to 1.3 m away, without the noise of mu."""
     eye = x + rng.uniform(0.8, 1.3) * _unit(rng.normal(size=3))
     ray = _unit(x - eye)
     C_eye = CAMERA_SIGMA_M**2 * np.eye(3)
@@ -167,7 +167,7 @@ def _by_camera(cls: str, x: Array, u: Array, rng: np.random.Generator) -> tuple[
         toward = _unit(ray - u * (u @ ray))
         _, axes = _tilted_about(u, toward, STEREO_LINE_RAD, rng)
         return x + rng.uniform(-0.1, 0.1) * u, C_stereo, _information_of(axes, STEREO_LINE_RAD)
-    # Plane through eye and edge: it turns about the edge's image end to end, and about the line across it.
+    # Plane through camera and edge: its errors are rotations about the viewing ray and about the edge.
     normal = _unit(np.cross(ray, u))
     length_px = rng.uniform(100, 250)
     sigmas = (PIXEL_SIGMA_PX / FOCAL_PX / math.sqrt(2), PIXEL_SIGMA_PX * math.sqrt(2) / length_px)
@@ -176,7 +176,7 @@ def _by_camera(cls: str, x: Array, u: Array, rng: np.random.Generator) -> tuple[
 
 
 def _tilted(direction: Array, sigmas: tuple[float, float], rng: np.random.Generator) -> tuple[Array, Array]:
-    """The direction with noise, and its information matrix."""
+    """Return the direction with noise, and its information matrix."""
     seen, axes = _tilted_about(direction, _unit(np.cross(direction, rng.normal(size=3))), sigmas, rng)
     return seen, _information_of(axes, sigmas)
 
@@ -184,7 +184,7 @@ def _tilted(direction: Array, sigmas: tuple[float, float], rng: np.random.Genera
 def _tilted_about(
     direction: Array, toward: Array, sigmas: tuple[float, float], rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """`direction` with a random tilt of sigmas[0] towards `toward` and sigmas[1] across it; and the two axes (2, 3)."""
+    """Return `direction` tilted randomly, with sigmas[0] towards `toward` and sigmas[1] across; and the axes (2, 3)."""
     first = _unit(toward - direction * (direction @ toward))
     second = np.cross(direction, first)
     seen = _unit(direction + rng.normal(0, sigmas[0]) * first + rng.normal(0, sigmas[1]) * second)
@@ -197,7 +197,7 @@ def _information_of(axes: Array, sigmas: tuple[float, float]) -> Array:
 
 
 def _stretched(C: Array, condition: float, rng: np.random.Generator) -> Array:
-    """A random covariance of the given condition number and the same largest variance as C, at random axes."""
+    """Return a random covariance with the given condition number, the largest variance of C, and random axes."""
     axes = Rotation.random(rng=rng).as_matrix()
     variances = np.linalg.eigvalsh(C)[2] * np.array([1.0, condition**-0.5, 1.0 / condition])
     return np.asarray(axes @ np.diag(variances) @ axes.T)

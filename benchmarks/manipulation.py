@@ -22,8 +22,8 @@ from hal.errors import CellError
 from manipulation.skills.outcome import ObjectState, Outcome, SkillReport
 from manipulation.skills.retreat import park
 
-ANGLE_SIGMA_RAD = np.radians(1.0)  # of the looks that the skills are given
-SLIDER_SIGMA = 0.4  # per cent of the scale: 0.4 mm
+ANGLE_SIGMA_RAD = np.radians(1.0)  # noise of the readings that the skills receive
+SLIDER_SIGMA = 0.4  # percent of the scale: 0.4 mm
 SLIDER_TOLERANCE_M = 0.0015
 LEVER_TOLERANCE_RAD = np.radians(5.0)
 WHEEL_TOLERANCE_RAD = np.radians(6.0)
@@ -41,7 +41,7 @@ PEAK_N = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """One skill on one seed."""
+    """Result of one skill with one seed."""
 
     skill: str
     seed: int
@@ -138,7 +138,7 @@ SKILLS: dict[str, Callable[[SimBench], Judged]] = {
 
 
 def trial(bench: SimBench, skill: str, seed: int) -> Trial:
-    """Executor one skill and judge it."""
+    """Execute one skill and judge it."""
     wall, sim = time.perf_counter(), bench.clock.now_s()
     try:
         report, is_right, error = SKILLS[skill](bench)
@@ -157,7 +157,7 @@ def trial(bench: SimBench, skill: str, seed: int) -> Trial:
 
 
 def wilson_lower(successes: int, trials: int, z: float = 1.96) -> float:
-    """Lower end of the 95 % interval of a proportion (Wilson, JASA 22, 1927)."""
+    """Return the lower end of the 95 % confidence interval of a proportion (Wilson, JASA 22, 1927)."""
     if trials == 0:
         return 0.0
     p = successes / trials
@@ -167,7 +167,7 @@ def wilson_lower(successes: int, trials: int, z: float = 1.96) -> float:
 
 
 def table(trials: list[Trial]) -> str:
-    """One line a skill, pass line beside measured value."""
+    """Return one line per skill, with the pass line beside the measured value."""
     head = (
         f"{'skill':10} {'right':>8} {'pass':>6} {'wilson':>7} {'first':>6} {'false':>6} {'peak med/max N':>16} "
         f"{'limit':>6} {'sim s':>6} {'RTF':>5}  outcomes"
@@ -192,7 +192,7 @@ def table(trials: list[Trial]) -> str:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--skills", default=",".join(SKILLS))
     parser.add_argument("--seeds", type=int, default=20)

@@ -32,7 +32,7 @@ HEAD = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """One judged mission; `places_m` (3,) in the base frame: where the simulator built each object."""
+    """Judged mission; `places_m` holds where the simulator built each object, (3,) in the base frame."""
 
     seed: int
     report: dict[str, Any]
@@ -40,13 +40,13 @@ class Run:
 
     @property
     def judge(self) -> dict[str, Any]:
-        """The verdict."""
+        """The judge's verdict."""
         verdict: dict[str, Any] = self.report["judge"]
         return verdict
 
     @property
     def by_surfaces_m(self) -> dict[str, float | None]:
-        """How far from the truth each object was found by its surfaces; None when it was not found."""
+        """Position error of each object found by its surfaces; None if it was not found."""
         return {
             check["name"]: None
             if check["centre_in_base_m"] is None
@@ -55,7 +55,7 @@ class Run:
         }
 
     def row(self) -> str:
-        """A line of the table."""
+        """Return a row of the table."""
         v, r = self.judge, self.report
         pose = ("-", "-") if v["pose_error_m"] is None else _pose(v)
         done = f"{sum(a['confirmed'] for a in r['actions'])}/{len(r['actions'])}"
@@ -72,7 +72,7 @@ class Run:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, print, and return 1 when a pass line is missed."""
+    """Run the missions and print; return 1 if a pass line is missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("first", type=int, nargs="?", default=1)
     parser.add_argument("last", type=int, nargs="?", default=20)
@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(seed: int, cell: Path) -> Run:
-    """One mission and its judgement, in a fresh service."""
+    """Run and judge one mission in a new service."""
     with tempfile.TemporaryDirectory() as folder:
         loaded = load_cell(cell, seed=seed)
         panelwright = Panelwright(loaded, Options(port=0, runs_dir=Path(folder)))
@@ -107,7 +107,7 @@ def run(seed: int, cell: Path) -> Run:
 
 
 def built_places(cell: Cell, seed: int) -> dict[str, Array]:
-    """Where the simulator builds each object of the panel with this seed: (3,) on the plate, base frame."""
+    """Return where the simulator builds each object of the panel with this seed: (3,) on the plate, base frame."""
     draws = Draws(seed)
     base_from_panel = draws.panel_pose(cell.file.workspace)
     return {
@@ -117,7 +117,7 @@ def built_places(cell: Cell, seed: int) -> dict[str, Array]:
 
 
 def summary(runs: Sequence[Run]) -> int:
-    """Print the figures of all runs beside their pass lines; 1 when one is missed."""
+    """Print the figures of all runs beside their pass lines; return 1 if one is missed."""
     n = len(runs)
     posed = [r.judge for r in runs if r.judge["pose_error_m"] is not None]
     done = sum(bool(r.report["succeeded"]) for r in runs)

@@ -1,7 +1,7 @@
-"""Paints the ten kinds of objects flat on a canvas in panel millimetres: own drawings in the manner of the data's README.
+"""Paints the ten kinds of objects on a canvas in panel millimetres, in the style that the README of the data describes.
 
-Nothing is copied from the development images: what they and these share is the kinds, their proportions and a layout grid.
-Grays are as they are seen; light, glare and exposure act on their linear values (see `panel_scene`).
+Nothing is copied from the development images; they have only the kinds, their proportions and the layout grid in
+common. Gray levels are gamma-encoded; light, glare and exposure are applied to linear values (see `panel_scene`).
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ Truth = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Canvas:
-    """A panel in millimetres, x right and y down, as (H, W) gray levels; `plate` is that of its plate."""
+    """Canvas of (H, W) gray levels in panel millimetres, x right and y down; `plate` is the gray level of the plate."""
 
     gray: NDArray[np.float32]
     plate: float = 0.0
 
     def polygon(self, points_mm: Any, gray: float) -> None:
-        """A filled polygon of (N, 2) points."""
+        """Fill a polygon of (N, 2) points."""
         px = np.round(np.asarray(points_mm, float) * PX_PER_MM * 16).astype(np.int32)
         cv2.fillPoly(self.gray, [px], gray, cv2.LINE_AA, 4)
 
     def disc(self, x: float, y: float, radius_mm: float, gray: float) -> None:
-        """A filled circle."""
+        """Fill a circle."""
         a = np.linspace(0, 2 * np.pi, 72, endpoint=False)
         self.polygon(np.column_stack([x + radius_mm * np.cos(a), y + radius_mm * np.sin(a)]), gray)
 
     def box(self, x: float, y: float, width_mm: float, height_mm: float, gray: float) -> None:
-        """A filled upright rectangle about its middle."""
+        """Fill an upright rectangle, given by its centre."""
         w, h = width_mm / 2, height_mm / 2
         self.polygon([[x - w, y - h], [x + w, y - h], [x + w, y + h], [x - w, y + h]], gray)
 
     def ray(
         self, x: float, y: float, angle_deg: float, span: tuple[float, float], width: tuple[float, float], gray: float
     ) -> None:  # fmt: skip
-        """A stroke along a ray from (x, y), clockwise from up, between two distances with a width at each, mm."""
+        """Draw a tapered stroke on a ray from (x, y), at an angle clockwise from up, between two distances, in mm."""
         a = np.deg2rad(angle_deg)
         along, across = np.array([np.sin(a), -np.cos(a)]), np.array([np.cos(a), np.sin(a)])
         p, q = (np.array([x, y]) + r * along for r in span)
@@ -57,7 +57,7 @@ class Canvas:
         self.polygon([p - u, q - v, q + v, p + u], gray)
 
     def text(self, x: float, y: float, words: str, height_mm: float, gray: float) -> None:
-        """Words about a middle."""
+        """Write text, given by its centre."""
         scale, thick = height_mm * PX_PER_MM / 22.0, max(1, round(0.15 * height_mm * PX_PER_MM))
         (w, h), _ = cv2.getTextSize(words, 0, scale, thick)
         at = (round(x * PX_PER_MM - w / 2), round(y * PX_PER_MM + h / 2))
@@ -65,7 +65,7 @@ class Canvas:
 
 
 def paint(canvas: Canvas, random: np.random.Generator, kind: str, x: float, y: float) -> Truth:
-    """An object of a kind at (x, y) mm; what a truth file says of it."""
+    """Paint an object of a kind at (x, y) mm and return its entry of the truth file."""
     painters = {
         "gauge": _gauge, "panel_meter": _meter, "display": _display, "toggle": _toggle, "rotary": _rotary, "button": _button,
         "lamp": _lamp, "slider": _slider, "handwheel": _handwheel, "lever": _lever,
@@ -125,7 +125,7 @@ def _meter(canvas: Canvas, random: np.random.Generator, x: float, y: float) -> T
     canvas.box(x + 1.2, y + 1.2, w, h, 50.0)
     canvas.box(x, y, w, h, DARK)
     canvas.box(x, y - 0.093 * h, w - 5.0, 0.686 * h, WHITE)
-    pivot = (x, y + 0.253 * h)  # the screw below it is only an ornament
+    pivot = (x, y + 0.253 * h)  # the screw below it has no function
     _ticks(canvas, pivot, (-45.0, 45.0), (0.6 * h, 0.54 * h), DARK, (low, high), 0.67 * h, 5 if unit != "mA" else 4)
     canvas.text(x, y - 0.06 * h, unit, 4.0, DARK)
     canvas.ray(*pivot, angle, (0.0, 0.555 * h), (0.8, 0.6), DARK)

@@ -1,9 +1,9 @@
-"""Overviews of panels that nobody has seen, in the three levels of the data's README, for measuring what was taught elsewhere.
+"""Draws overviews of unseen panels in the three levels of the data's README, to test what was taught on other images.
 
-A panel of twelve objects (`panel_paint`) is laid into the picture by a pinhole camera and meets, in linear light: a slope of
-illumination, glare, a shadow, cables, exposure, blur, motion, shot and read noise; then a gamma of 2.2 and eight bits.
-Amounts follow the README: easy up to 3 degrees of tilt, nothing across; medium 12, one glare, one shadow; hard 24, three
-glares, one shadow, two cables, exposure x0.35 to x1.5, motion blur.
+A panel of twelve objects (`panel_paint`) is projected into the image by a pinhole camera and degraded, in linear light,
+by an illumination gradient, glare, shadow, cables, exposure, blur, motion, shot and read noise; then come a gamma of
+2.2 and eight bits. Amounts follow the README: easy has up to 3 degrees of tilt and nothing in front; medium 12 degrees,
+one glare and one shadow; hard 24 degrees, three glares, one shadow, two cables, exposure x0.35 to x1.5 and motion blur.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ SIZE_PX = (640, 480)
 FOCAL_PX = 830.0
 GAMMA = 2.2
 GUESS_SIGMA_PX = 2.0
-LEAST_VISIBLE, MOST_SATURATED = 0.855, 0.25  # of an object that counts as readable
+LEAST_VISIBLE, MOST_SATURATED = 0.855, 0.25  # visible and saturated fractions of an object that counts as readable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Level:
-    """How much of everything: ranges from least to most."""
+    """Amounts of all degradations at one level; pairs are minimum and maximum."""
 
     tilt_rad: float
     slope: tuple[float, float]
@@ -58,7 +58,7 @@ AMOUNTS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """A drawn overview: its picture, the truth (as a truth file says it) and the job of reading it taught."""
+    """Drawn overview: its image, its truth (as in a truth file) and the job of reading it as a taught panel."""
 
     image: Image
     truth: dict[str, Any]
@@ -66,7 +66,7 @@ class Scene:
 
 
 def draw_scene(seed: int, level: str) -> Scene:
-    """The overview of a seed at a level."""
+    """Draw the overview of a seed at a level."""
     random = np.random.default_rng((seed, LEVELS.index(level)))
     amount = AMOUNTS[level]
     plate = float(random.uniform(110, 185))
@@ -91,7 +91,7 @@ def draw_scene(seed: int, level: str) -> Scene:
 
 
 def _placed(random: np.random.Generator, most_rad: float) -> Array:
-    """(3, 3) pixels from panel millimetres: a pinhole camera before the panel, tilted and turned a little."""
+    """Return the (3, 3) homography from panel millimetres to pixels of a camera that is tilted and rotated slightly."""
     lean, tilt = random.uniform(0, 2 * np.pi), most_rad * np.sqrt(random.uniform(0.1, 1.0))
     axis = np.array([np.cos(lean), np.sin(lean), 0.0])
     turn = (
@@ -106,12 +106,12 @@ def _placed(random: np.random.Generator, most_rad: float) -> Array:
 def _taken(
     random: np.random.Generator, panel: NDArray[np.float32], px_from_mm: Array, amount: Level
 ) -> tuple[Image, Array, NDArray[np.bool_]]:
-    """The picture, the share of every pixel that cables cover, and where it is saturated."""
-    k = 2  # drawn twice as large as it is taken
+    """Return the image, the fraction of every pixel that cables cover, and the mask of saturated pixels."""
+    k = 2  # drawn at twice the final resolution
     size = (k * SIZE_PX[0], k * SIZE_PX[1])
     grow = np.diag([k, k, 1.0]) @ px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1.0])
     scene = np.full(size[::-1], (float(random.uniform(DARK, 65)) / 255) ** GAMMA, np.float32)
-    border = cv2.BORDER_TRANSPARENT  # the wall stays
+    border = cv2.BORDER_TRANSPARENT  # the wall around the panel stays
     cv2.warpPerspective((panel / 255) ** GAMMA, grow, size, dst=scene, flags=cv2.INTER_LINEAR, borderMode=border)
     return pictured(random, scene.astype(float), amount, SIZE_PX)
 
@@ -119,10 +119,10 @@ def _taken(
 def pictured(
     random: np.random.Generator, light: Array, amount: Level, size_px: tuple[int, int]
 ) -> tuple[Image, Array, NDArray[np.bool_]]:
-    """A picture of linear light under a level's light, cables, lens and noise.
+    """Degrade an image of linear light by a level's light, cables, lens and noise.
 
     Returns:
-        The picture, the share of every pixel that cables cover, and where it is saturated.
+        The image, the fraction of every pixel that cables cover, and the mask of saturated pixels.
     """
     light = _lit(random, light, amount)
     cover = _cables(random, (light.shape[1], light.shape[0]), amount.cables)
@@ -138,7 +138,7 @@ def pictured(
 
 
 def _lit(random: np.random.Generator, scene: Array, amount: Level) -> Array:
-    """(H, W) linear light of a scene under a slope of illumination, shadows and glare."""
+    """Return the (H, W) linear light of a scene with an illumination gradient, shadows and glare."""
     h, w = scene.shape
     v, u = np.mgrid[:h, :w] / w
     lean = random.uniform(0, 2 * np.pi)
@@ -155,7 +155,7 @@ def _lit(random: np.random.Generator, scene: Array, amount: Level) -> Array:
 
 
 def _cables(random: np.random.Generator, size: tuple[int, int], count: int) -> Array:
-    """(H, W) share of every pixel that lies behind cables, which hang from top to bottom with one bend."""
+    """Return the (H, W) fraction of every pixel that is behind cables, which run from top to bottom with one bend."""
     w, h = size
     cover = np.zeros((h, w), np.float32)
     for _ in range(count):
@@ -168,7 +168,7 @@ def _cables(random: np.random.Generator, size: tuple[int, int], count: int) -> A
 
 
 def _moved(random: np.random.Generator, image: Array, length_px: float) -> Array:
-    """The picture smeared along a direction."""
+    """Return the image with motion blur in a random direction."""
     if length_px < 0.3:
         return image
     a, steps = random.uniform(0, np.pi), 9
@@ -180,7 +180,7 @@ def _moved(random: np.random.Generator, image: Array, length_px: float) -> Array
 
 
 def seen(panel_object: Truth, px_from_mm: Array, cover: Array, bright: NDArray[np.bool_]) -> Truth:
-    """Where an object lies in the picture and how much of it can be seen."""
+    """Return where an object is in the image and how much of it is visible."""
     (x, y), (w, h) = panel_object["center_mm"], (s / 2 for s in panel_object["size"])
     quad = _applied(px_from_mm, np.array([[x - w, y - h], [x + w, y - h], [x + w, y + h], [x - w, y + h]]))
     margin = 400
@@ -200,7 +200,7 @@ def seen(panel_object: Truth, px_from_mm: Array, cover: Array, bright: NDArray[n
 
 
 def _taught_job(random: np.random.Generator, truth: dict[str, Any]) -> dict[str, Any]:
-    """What a reader of the taught panel gets: the layout, and where the panel is to about two pixels."""
+    """Return the input of a reader of the taught panel: the layout, and the panel's position to about two pixels."""
     width, height = truth["panel_mm"]
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
     px = _applied(np.array(truth["H_mm_to_px"]), corners) + random.normal(0, GUESS_SIGMA_PX, (4, 2))

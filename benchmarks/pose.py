@@ -32,7 +32,7 @@ SHAPES = [
 
 
 def camera_of(problem: Problem) -> CameraIntrinsics:
-    """The problem's camera as the library wants it."""
+    """Return the problem's camera as the library's intrinsics."""
     K = problem["K"]
     return CameraIntrinsics(
         width_px=int(K["width"]), height_px=int(K["height"]), fx_px=K["fx"], fy_px=K["fy"], cx_px=K["cx"], cy_px=K["cy"]
@@ -40,7 +40,7 @@ def camera_of(problem: Problem) -> CameraIntrinsics:
 
 
 def solve(problem: Problem) -> tuple[QuadranglePose, float]:
-    """The estimate and the milliseconds that it took, from arrays to pose, covariance, alternatives and flag."""
+    """Return the estimate and its time in milliseconds, from arrays to pose, covariance, alternatives and flag."""
     points, pixels = np.array(problem["points_obj"]), np.array(problem["points_img"])
     camera, variance = camera_of(problem), problem["sigma_px"] ** 2
     started_s = time.perf_counter()
@@ -49,7 +49,7 @@ def solve(problem: Problem) -> tuple[QuadranglePose, float]:
 
 
 def solution(problem: Problem, *, timed: bool) -> dict[str, Any]:
-    """One answer in the schema of data/pose (rotation first)."""
+    """Return one answer in the schema of data/pose (rotation first)."""
     pose, ms = solve(problem)
     answer: dict[str, Any] = {
         "R": pose.rotation.tolist(),
@@ -65,7 +65,7 @@ def solution(problem: Problem, *, timed: bool) -> dict[str, Any]:
 
 
 def opencv(method: str) -> Callable[[Problem], tuple[Array, Array]]:
-    """cv2.solvePnP with the named method, as users call it."""
+    """Return a solver that calls cv2.solvePnP with the named method, as users call it."""
     import cv2
 
     flag = getattr(cv2, f"SOLVEPNP_{method}")
@@ -82,7 +82,7 @@ def opencv(method: str) -> Callable[[Problem], tuple[Array, Array]]:
 
 
 def poselib_robust(problem: Problem) -> tuple[Array, Array]:
-    """poselib.estimate_absolute_pose with its refinement."""
+    """Solve by poselib.estimate_absolute_pose with its refinement."""
     import poselib
 
     K = problem["K"]
@@ -95,7 +95,7 @@ def poselib_robust(problem: Problem) -> tuple[Array, Array]:
 
 
 def gtsam_refined(problem: Problem) -> tuple[Array, Array]:
-    """gtsam's Levenberg-Marquardt over projection factors with fixed landmarks, started from cv2's AP3P."""
+    """Solve by gtsam's Levenberg-Marquardt over projection factors with fixed landmarks, started from cv2's AP3P."""
     import gtsam
 
     K = problem["K"]
@@ -121,13 +121,16 @@ def _matrix(problem: Problem) -> Array:
 
 
 def efficiency(cases: list[Problem], solver: Callable[[Problem], tuple[Array, Array]]) -> dict[str, float]:
-    """RMS over bound (position, rotation) without flips where the bound is below 3 degrees, flips and median time."""
+    """Return the ratio of RMS error to bound (position, rotation), the fraction of flips and the median time.
+
+    The ratios are for cases without flip whose bound is below 3 degrees.
+    """
     position, rotation, flips, times_ms, failed = [], [], 0, [], 0
     for case in cases:
         started_s = time.perf_counter()
         try:
             R, t = solver(case)
-        except Exception:  # a peer may throw its own kind; it counts as failed
+        except Exception:  # a peer may raise any type; it counts as failed
             failed += 1
             continue
         times_ms.append((time.perf_counter() - started_s) * 1e3)
@@ -146,13 +149,13 @@ def efficiency(cases: list[Problem], solver: Callable[[Problem], tuple[Array, Ar
 
 
 def ours(case: Problem) -> tuple[Array, Array]:
-    """This library's pose."""
+    """Solve by this library."""
     pose, _ = solve(case)
     return pose.rotation, pose.translation_m
 
 
 def consistency(cases: list[Problem]) -> float:
-    """Mean NEES / 6 where the rotation's bound is below 1 degree, without flips."""
+    """Return the mean NEES / 6 over the cases whose rotation bound is below 1 degree, without flips."""
     values = []
     for case in cases:
         bound = np.array(case["bound"])
@@ -166,7 +169,7 @@ def consistency(cases: list[Problem]) -> float:
 
 
 def mirrors(cases: list[Problem]) -> dict[str, float]:
-    """Shares of flips, flags, flips without flag, and of problems where the answer or an alternative is not flipped."""
+    """Return the fractions of flips, flags, flips without flag, and cases with an unflipped answer or alternative."""
     rows = []
     for case in cases:
         pose, _ = solve(case)
@@ -178,7 +181,7 @@ def mirrors(cases: list[Problem]) -> dict[str, float]:
 
 
 def table(*, quick: bool) -> Iterator[tuple[str, str, str]]:
-    """Rows of (what, pass line, measured), as they come."""
+    """Yield rows of (what, pass line, measured)."""
     n = 300 if quick else 2000
     warm_up()
     mixed = problems(
@@ -231,7 +234,7 @@ def _light_rows(*, quick: bool) -> Iterator[tuple[str, str, str]]:
 
 
 def development_rows() -> list[tuple[str, str, str]]:
-    """The same figures on the stored development problems, when they are there."""
+    """Return the same figures for the stored development problems, if they exist."""
     if not DEVELOPMENT.exists():
         return [("development problems", "-", "not found beside the repository")]
     cases = json.loads(DEVELOPMENT.read_text())["problems"]
@@ -248,7 +251,7 @@ def development_rows() -> list[tuple[str, str, str]]:
 
 
 def main() -> None:
-    """Command line; see the top of this file."""
+    """Run the command line; see the top of this file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="?", type=Path)
     parser.add_argument("out", nargs="?", type=Path)

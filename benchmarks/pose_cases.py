@@ -1,6 +1,6 @@
 """Simulated four-light problems with their Cramer-Rao bound, in the schema of the development set.
 
-Nothing of `perception` is used here: the bound and the errors that the table shows come from this file's own formulae.
+This module does not use `perception`: the bound and the errors in the table are computed by its own formulae.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def problems(
     seed: int, count: int, *, shapes: list[str], tilt_deg: tuple[float, float], sigma_px: list[float],
     range_m: list[float],
 ) -> list[Problem]:  # fmt: skip
-    """`count` random views that keep all four lights inside a 1280x960 image."""
+    """Return `count` random views that have all four lights inside a 1280x960 image."""
     rng = np.random.default_rng(seed)
     made: list[Problem] = []
     while len(made) < count:
@@ -64,7 +64,7 @@ def _problem(rng: np.random.Generator, shape: str, tilt_deg: float, sigma_px: fl
 
 
 def _facing(normal: Array, rng: np.random.Generator, tilt_rad: float) -> Array:
-    """A rotation that shows the plane's front to the camera, tilted against the optical axis, with any roll."""
+    """Return a rotation that shows a plane's front to the camera, tilted from the optical axis, with random roll."""
     onto = Rotation.align_vectors([[0.0, 0.0, -1.0]], [normal])[0]
     azimuth = rng.uniform(0, 2 * np.pi)
     tilt = Rotation.from_rotvec(tilt_rad * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
@@ -72,14 +72,14 @@ def _facing(normal: Array, rng: np.random.Generator, tilt_rad: float) -> Array:
 
 
 def pixels_of(X: Array, R: Array, t: Array, camera: dict[str, float]) -> Array:
-    """(N, 2) pixels of (N, 3) object points; NaN behind the camera."""
+    """Return the (N, 2) pixels of (N, 3) object points; NaN behind the camera."""
     q = X @ R.T + t
     z = np.where(q[:, 2:] > 0, q[:, 2:], np.nan)
     return np.asarray(q[:, :2] / z * [camera["fx"], camera["fy"]] + [camera["cx"], camera["cy"]])
 
 
 def cramer_rao(X: Array, R: Array, t: Array, camera: dict[str, float], sigma_px: float) -> Array:
-    """6x6 bound sigma^2 (J^T J)^-1, rotation then translation as in the development set, J by central differences."""
+    """Return the 6x6 bound sigma^2 (J^T J)^-1, rotation first as in the development set; J by central differences."""
     columns = []
     for k in range(6):
         ahead, back = (_moved(R, t, h * np.eye(6)[k]) for h in (1e-6, -1e-6))
@@ -93,13 +93,13 @@ def _moved(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
 
 
 def error(problem: Problem, R: Array, t: Array) -> Array:
-    """(6,) rotation vector and translation from the estimate to the truth."""
+    """Return the (6,) rotation vector and translation from the estimate to the truth."""
     turn = Rotation.from_matrix(np.array(problem["R_true"]) @ R.T).as_rotvec()
     return np.concatenate([turn, np.array(problem["t_true"]) - t])
 
 
 def is_flipped(problem: Problem, R: Array) -> bool:
-    """Is the estimated normal nearer to the mirrored true one than to the true one, and more than 5 degrees off?"""
+    """Return whether the estimated normal is nearer to the mirrored true one, and more than 5 degrees off."""
     X, Rt, tt = (np.array(problem[k]) for k in ("points_obj", "R_true", "t_true"))
     normal = np.linalg.svd(X - X.mean(axis=0))[2][2]
     sight = Rt @ X.mean(axis=0) + tt

@@ -1,4 +1,4 @@
-"""Hand-eye calibration in simulation: twelve stations before the panel's lights, from pixels to the mount."""
+"""Hand-eye calibration in simulation: from the pixels of the panel's lights at twelve arm poses to the mount."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ARM_SIGMA = 1e-4  # m and rad
 
 
 def trial(seed: int) -> tuple[float, float]:
-    """Errors of flange_from_camera in mm and degrees, for a random mount and panel."""
+    """Return the errors of flange_from_camera in mm and degrees, for a random mount and panel."""
     rng = np.random.default_rng(seed)
     x = transform_rpy(rng.uniform(-0.08, 0.08, 3), rng.uniform(-0.3, 0.3, 3) + np.array([0.0, 0.0, np.pi / 2]))
     z = transform_rpy([0.9, rng.uniform(-0.1, 0.1), 0.5], [0.0, -np.pi / 2, rng.uniform(-0.3, 0.3)])
@@ -38,7 +38,7 @@ def trial(seed: int) -> tuple[float, float]:
 
 
 def rows(count: int) -> list[tuple[str, str, str]]:
-    """The table row over `count` random cells."""
+    """Return the table rows over `count` random cells."""
     errors = np.array([trial(seed) for seed in range(count)])
     middle, worst = np.median(errors, axis=0), errors.max(axis=0)
     figures = f"median {middle[0]:.2f} mm, {middle[1]:.3f} deg; worst of {count}: {worst[0]:.2f} mm, {worst[1]:.3f} deg"

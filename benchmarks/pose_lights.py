@@ -1,7 +1,7 @@
-"""Light pairs: the stored ones beside the repository, and drawn ones with other lamps, cameras and troubles.
+"""Image pairs with lights on and off: stored ones beside the repository, and drawn ones with other lamps and cameras.
 
-Bright pairs differ by the lights, exposure, noise and half a pixel of motion. Stress pairs have dim lights, up to 3 px
-and 0.2 degrees of motion, glare that moves, and panel lamps that switch in between.
+The images of a bright pair differ by the lights, exposure, noise and half a pixel of motion. Stress pairs have dim
+lights, up to 3 px and 0.2 degrees of motion, moving glare, and panel lamps that switch between the images.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HIDDEN_PX = 6.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LightPair:
-    """Two images, the taught lights (4, 3) m in the panel's frame, their true pixels, and which can be seen."""
+    """Two images, the taught lights (4, 3) m in the panel frame, their true pixels, and which lights are visible."""
 
     off: NDArray[Any]
     on: NDArray[Any]
@@ -40,7 +40,7 @@ class LightPair:
 
 
 def stored_pairs(*, stress: bool) -> Iterator[LightPair]:
-    """The development pairs; none when the data are not there."""
+    """Yield the development pairs; none if the data do not exist."""
     truth = STORED / "truth.json"
     if not truth.exists():
         return
@@ -49,7 +49,7 @@ def stored_pairs(*, stress: bool) -> Iterator[LightPair]:
             continue
         on, off = (cv2.imread(str(STORED / n), cv2.IMREAD_GRAYSCALE) for n in (name, name.replace("_on", "_off")))
         mm = np.array(entry["lights_mm"], float)
-        flat = (mm - mm.mean(axis=0)) * [1e-3, -1e-3]  # the file's y points down
+        flat = (mm - mm.mean(axis=0)) * [1e-3, -1e-3]  # y points down in the file
         yield LightPair(
             off=np.asarray(off), on=np.asarray(on), lights_m=np.column_stack([flat, np.zeros(4)]),
             lights_px=np.array(entry["lights_px"], float), visible=np.array(entry["lights_visible"], bool),
@@ -57,7 +57,7 @@ def stored_pairs(*, stress: bool) -> Iterator[LightPair]:
 
 
 def score_pairs(pairs: Iterable[LightPair]) -> str:
-    """Share of pairs with every visible light within 3 px and no false one, and the size of errors and times."""
+    """Return the fraction of pairs with every visible light within 3 px and no false one, with errors and times."""
     right, errors, times_ms, total = 0, [], [], 0
     for pair in pairs:
         total += 1
@@ -81,7 +81,7 @@ def score_pairs(pairs: Iterable[LightPair]) -> str:
 
 
 def seen_lights(pair: LightPair) -> Array:
-    """(N, 2) lights that the library finds without a calibrated camera; none when it refuses."""
+    """Return the (N, 2) lights that the library finds without camera calibration; none if it refuses."""
     try:
         blobs = find_lights(pair.off, pair.on)
         lights = assign_lights(blobs, pair.lights_m, image_size_px=(pair.on.shape[1], pair.on.shape[0]), least=2)
@@ -91,7 +91,7 @@ def seen_lights(pair: LightPair) -> Array:
 
 
 def drawn_pairs(count: int, *, stress: bool, seed: int = 0) -> Iterator[LightPair]:
-    """`count` drawn pairs with two visible lights or more, levels easy, medium and hard in turn."""
+    """Yield `count` drawn pairs with two visible lights or more; the levels easy, medium and hard alternate."""
     for k in range(count):
         rng = np.random.default_rng([seed, k, int(stress)])
         pair = _draw(rng, hard=(k % 3) / 2.0, stress=stress)
@@ -129,7 +129,7 @@ def _draw(rng: np.random.Generator, *, hard: float, stress: bool) -> LightPair:
         for place, spread, strength in moved:
             scene = scene + _bump(place, spread, strength)
         for ends in cables:
-            scene = _cable(scene, ends + (0.0 if on else 1.2 * motion[0]), 6 + 4 * hard)  # nearer, so it moves more
+            scene = _cable(scene, ends + (0.0 if on else 1.2 * motion[0]), 6 + 4 * hard)  # moves more as it is nearer
         levels.append(gains[int(on)] * np.asarray(cv2.GaussianBlur(scene, (0, 0), blur)))
     noise = 0.7 + 5.0 * hard
     off, on_image = (_expose(level, noise, rng) for level in levels)
@@ -140,7 +140,7 @@ def _draw(rng: np.random.Generator, *, hard: float, stress: bool) -> LightPair:
 
 
 def _homography(rng: np.random.Generator, size: Array, tilt_rad: float) -> Array:
-    """Pixels from panel metres for a random camera that keeps the panel about in view."""
+    """Return the homography from panel metres to pixels of a random camera that has the panel roughly in view."""
     focal = rng.uniform(0.9, 1.6) * WIDTH
     axis = rng.uniform(0, 2 * np.pi)
     tilt = cv2.Rodrigues(rng.uniform(0.2, 1.0) * tilt_rad * np.array([np.cos(axis), np.sin(axis), 0.0]))[0]
@@ -165,7 +165,7 @@ def _apply(H: Array, points_m: Array) -> Array:
 
 
 def _things(rng: np.random.Generator, size: Array) -> list[tuple[str, Array, float, float]]:
-    """(kind, place, radius, brightness) on a loose grid."""
+    """Return (kind, position, radius, brightness) of objects on a loose grid."""
     things = []
     for x in np.linspace(-0.36, 0.36, 4):
         for y in np.linspace(-0.3, 0.3, 3):
@@ -240,7 +240,7 @@ def _expose(level: NDArray[Any], noise: float, rng: np.random.Generator) -> Gray
 
 
 def _visible(levels: list[NDArray[Any]], lights_px: Array, noise: float) -> NDArray[np.bool_]:
-    """Inside the image, not covered, and brighter when on even after the sensor clips."""
+    """Return which lights are inside the image, not covered, and brighter when on even after the sensor saturates."""
     on = np.clip(levels[1], 0, 255)
     shown = []
     for u, v in np.round(lights_px).astype(int):

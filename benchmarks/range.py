@@ -34,12 +34,12 @@ from perception.range.window import Window
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "range"
 MM = 1000.0
-MATCHED_SEEDS = 5  # fourteen components a scene
-PEER_SEEDS = 2  # a peer takes seconds an image
+MATCHED_SEEDS = 5  # with fourteen components per scene
+PEER_SEEDS = 2  # a peer takes seconds per image
 
 
 def main() -> None:
-    """Command line entry; see the module's docstring."""
+    """Run the command line; see the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="?", type=Path)
     parser.add_argument("out", nargs="?", type=Path)
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def predict(cases: Path, out: Path, *, timed: bool, codes: bool) -> None:
-    """Write one prediction a case into `out`; a case that cannot be read gets an empty one and a line on stderr."""
+    """Write one prediction per case into `out`; for an unreadable case an empty one and a line on stderr."""
     out.mkdir(parents=True, exist_ok=True)
     for path in sorted(cases.glob("*.npz")):
         depth, sensor = load_recording(path, codes=codes)
@@ -78,7 +78,7 @@ def _save(path: Path, arrays: dict[str, Any]) -> None:
 
 
 def prediction(surface: Surface) -> dict[str, Any]:
-    """A surface as the scorer reads it, millimetres."""
+    """Return a surface in the scorer's format, in millimetres."""
     p = surface.primitive
     out: dict[str, Any] = {"id": surface.label, "type": str(surface.type), "rms": surface.rms_m * MM}
     if isinstance(p, Plane):
@@ -95,7 +95,7 @@ def prediction(surface: Surface) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """One line of the table: a name, the pass line as text, the measured value as text, and whether it passes."""
+    """Line of the table: name, pass line as text, measured value as text, and whether it passes."""
 
     name: str
     needed: str
@@ -104,7 +104,7 @@ class Line:
 
 
 def print_table(seeds: int) -> None:
-    """Measure every line on development scenes and print pass line beside measured value."""
+    """Measure every line on development scenes and print the pass lines beside the measured values."""
     if not (DATA / "gen.py").exists():
         print("the range development data is not beside this repository: nothing to measure", file=sys.stderr)
         return
@@ -122,7 +122,7 @@ def print_table(seeds: int) -> None:
 
 
 def range_module(name: str) -> ModuleType:
-    """A program of the range development data (`gen` or `score`) as a module."""
+    """Return a program of the range development data (`gen` or `score`) as a module."""
     spec = importlib.util.spec_from_file_location(f"range_{name}", DATA / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -195,7 +195,7 @@ def _quality_lines(gen: ModuleType, score: ModuleType, seeds: int) -> list[Line]
 
 
 def _all_six(row: dict[str, Any]) -> bool:
-    """All six surfaces of fig10 found and named, and nothing else."""
+    """Return whether all six surfaces of fig10 are found with the right type, and nothing else."""
     h = row["hoover"]["0.8"]
     return bool(h["correct"] == h["ms"] == 6 and all(a == b for a, b in row["types"]))
 
@@ -219,7 +219,7 @@ def _code_lines(gen: ModuleType, score: ModuleType, seeds: int) -> list[Line]:
 
 
 def _real_lines(score: ModuleType) -> list[Line]:
-    """The one real frame with truth; the others have none and are looked at in the docs."""
+    """Return the line of the only real frame with known truth."""
     path = DATA / "real" / "icl_living_room_0.npz"
     if not path.exists():
         return []
@@ -250,7 +250,7 @@ def _matching_lines(gen: ModuleType, seeds: int) -> list[Line]:
 
 
 def _sensor_lines(gen: ModuleType, score: ModuleType, seeds: int) -> list[Line]:
-    """Table tops as structured light, stereo and time of flight see them: many images with truth, but simulated."""
+    """Return the lines of simulated table tops seen by structured light, stereo and time-of-flight sensors."""
     numbers = range(100, 100 + max(1, seeds // 4))
     summary, _ = _scored(score, [table_top(gen, sensor, seed) for sensor in SENSORS for seed in numbers])
     return [
@@ -262,7 +262,7 @@ def _sensor_lines(gen: ModuleType, score: ModuleType, seeds: int) -> list[Line]:
 
 
 def _soft_lines(gen: ModuleType, score: ModuleType, numbers: range) -> list[Line]:
-    """Cartons with bulged faces and rounded edges on a table, and a room with a sofa, by every sensor."""
+    """Return the lines of cartons with bulging faces and rounded edges on a table, and of a room with a sofa."""
     out = []
     for scene in SCENES:
         summary, _ = _scored(score, [soft_scene(gen, scene, sensor, seed) for sensor in VIEWS for seed in numbers])
@@ -274,7 +274,7 @@ def _soft_lines(gen: ModuleType, score: ModuleType, numbers: range) -> list[Line
 
 
 def _room_lines(gen: ModuleType, score: ModuleType, numbers: range) -> list[Line]:
-    """Furnished rooms by every sensor: no pass line of the issue is theirs."""
+    """Return the lines of furnished rooms seen by every sensor; they have no pass lines."""
     out = []
     for view in range_rooms.VIEWS:
         hoover = _scored(score, [range_rooms.room(gen, view, seed) for seed in numbers])[0]["hoover"]
@@ -295,7 +295,7 @@ def _time_lines(gen: ModuleType) -> list[Line]:
             case = _cases(gen, scene, 1, **kind)[0]
             depth, sensor = case_depth(case, False), sensor_from_meta(case["meta"]["sensor"], 1 / MM)
             analyse(depth, sensor)
-            # One thread's CPU time: other programs on the machine do not count.
+            # CPU time of one thread, so that other programs on the machine do not count.
             ms = _median_ms(partial(analyse, depth, sensor), 7, clock=time.process_time)
             whole.append(ms)
             ratios.append(ms / _median_ms(filter_pass(depth, sensor), 15, clock=time.process_time))
@@ -319,7 +319,7 @@ def _median_ms(work: Callable[[], object], repeats: int, clock: Callable[[], flo
 
 
 def _peer_lines(gen: ModuleType, score: ModuleType) -> list[Line]:
-    """Correct regions and time of other people's segmenters, where they are installed, and ours on the same images."""
+    """Return correct regions and times of third-party segmenters, if installed, and of ours on the same images."""
     cases = [case for scene in ("polyhedra", "fig10", "curved") for case in _cases(gen, scene, PEER_SEEDS)]
     seen = [(case_depth(case, False), sensor_from_meta(case["meta"]["sensor"], 1 / MM)) for case in cases]
     peers = range_peers.peer_results(score, [(c, MM * s.points(d)) for c, (d, s) in zip(cases, seen, strict=True)])

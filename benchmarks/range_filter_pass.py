@@ -1,10 +1,11 @@
-"""Normals, mean and gaussian curvature of a range image in single precision: with a median and a gaussian, a unit of times.
+"""Filter pass as a unit of time: median, Gaussian, normals, mean and Gaussian curvature in single precision.
 
-The fundamental forms of the surface X(u, v) = O + z D of the image's rays, of which the paper's graph g(u, v) is a special case:
+The curvatures follow from the fundamental forms of the surface X(u, v) = O + z D over the image's rays, of which the
+paper's graph g(u, v) is a special case:
 
     n = X_u x X_v / |X_u x X_v|;  H = (e G - 2 f F + g E) / (2 (E G - F^2));  K = (e g - f^2) / (E G - F^2)
 
-Curvature is positive for a surface that bulges towards the sensor.
+Curvature is positive for a surface that is convex towards the sensor.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from perception.range.sensor import RangeSensorModel
 
 Single = NDArray[np.float32]
 
-CHUNK, ROW = 128, 144  # pixels worked on at a time; a row of the scratch array holds them and a neighbour on each side
+CHUNK, ROW = 128, 144  # pixels per step; a row of the scratch array holds them and a neighbour on each side
 ABOVE, HERE, BELOW = 0, ROW, 2 * ROW  # rows of depth, each from one pixel before the chunk
 ACROSS = 3 * ROW  # x of each pixel's ray at depth 1
 GU, GV, NORMAL, MEAN, GAUSS = 4 * ROW, 5 * ROW, 6 * ROW, 9 * ROW, 10 * ROW  # the normal takes three rows
@@ -31,7 +32,7 @@ SCRATCH = 11 * ROW
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocalGeometry:
-    """(H, W) maps; NaN beside holes and at the image border.
+    """(H, W) maps of derivatives, normals and curvatures; NaN beside holes and at the image border.
 
     `gu`, `gv`: metres of depth per pixel. `normal` (H, W, 3) towards the sensor. `mean_curvature_per_m`,
     `gaussian_curvature_per_m2`: H and K.
@@ -45,7 +46,7 @@ class LocalGeometry:
 
 
 def geometry_of(depth_m: Array | Single, sensor: RangeSensorModel) -> LocalGeometry:
-    """Geometry by central differences of an already smoothed (H, W) depth image."""
+    """Return the local geometry of a smoothed (H, W) depth image by central differences."""
     z = np.ascontiguousarray(depth_m, np.float32)
     gu, gv, mean, gauss = (np.empty_like(z) for _ in range(4))
     normal = np.empty((*z.shape, 3), z.dtype)
@@ -54,9 +55,9 @@ def geometry_of(depth_m: Array | Single, sensor: RangeSensorModel) -> LocalGeome
 
 
 def filter_pass(depth_m: Array, sensor: RangeSensorModel) -> Callable[[], object]:
-    """Median 5x5, gaussian, derivatives, normals, H and K of one image, ready to be timed.
+    """Return a function to be timed: 5x5 median, Gaussian, derivatives, normals, H and K of one image.
 
-    The fastest that we have: OpenCV's median and gaussian on one thread, and our fused, vectorised derivatives.
+    It is our fastest version: OpenCV's median and Gaussian on one thread, then fused and vectorised derivatives.
     """
     cv2.setNumThreads(1)
     single = depth_m.astype(np.float32)
@@ -74,7 +75,7 @@ def _fused(
     z: Single, sen: Array, work: Single, gu: Single, gv: Single, normal: Single,
     mean: Single, gauss: Single,
 ) -> None:  # fmt: skip
-    """Fill the maps from `z` (H, W), a chunk of a row at a time; all in the type of `z`, `work` (SCRATCH,) too."""
+    """Fill the maps from `z` (H, W), a chunk of a row at a time; all arrays, also `work` (SCRATCH,), have z's type."""
     H, W = z.shape
     for v in range(H):
         if v in (0, H - 1):
@@ -99,7 +100,7 @@ def _fused(
 
 @compiled(fastmath=REORDERED)
 def _forms(n: int, y: float | np.float32, sen: Array, work: Single) -> None:
-    """Derivatives, normal, H and K of one chunk, without a branch: rows 4 to 10 of `work` from rows 0 to 3."""
+    """Compute derivatives, normal, H and K of one chunk without branches: rows 4 to 10 of `work` from rows 0 to 3."""
     as_type = work.dtype.type
     half, quarter, two, one = as_type(0.5), as_type(0.25), as_type(2.0), as_type(1.0)
     # X = z (p x, p y, 1) + (1 - p) (x, y, 0), p = 1 for a pinhole and 0 for parallel rays.
@@ -125,7 +126,7 @@ def _forms(n: int, y: float | np.float32, sen: Array, work: Single) -> None:
         inverse = one / np.sqrt(area)
         n0, n1, n2 = n0 * inverse, n1 * inverse, n2 * inverse
         E, F, G = xu0 * xu0 + xu1 * xu1 + zu * zu, xu0 * xv0 + xu1 * xv1 + zu * zv, xv0 * xv0 + xv1 * xv1 + zv * zv
-        # Towards the sensor is outward, so a bulge curves against the normal: minus signs make it positive.
+        # The normal points outward to the sensor, and a convex surface curves away from it, hence the minus signs.
         e, f, g = -(a0 * n0 + a1 * n1 + zuu * n2), -(b0 * n0 + b1 * n1 + zuv * n2), -(d0 * n0 + d1 * n1 + zvv * n2)
         inverse *= inverse
         work[GU + i] = zu + nothing

@@ -34,9 +34,10 @@ RIGHT_WITHIN_M = 0.010
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Thing:
-    """A component that stands in a scene: kind, pose in the sensor's frame, and how many turns look the same.
+    """Component of a scene: kind, pose in the sensor's frame, and symmetry.
 
-    `turns` is 0 where any turn about z does; `state` in metres or radians where the kind has one that can be known.
+    `turns` is the number of rotations about z that look the same, 0 if all do; `state` is in metres or radians, if the
+    kind has one that can be measured.
     """
 
     model: str
@@ -48,7 +49,7 @@ class Thing:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatchingCase:
-    """A depth image (m) with the scorer's `meta`, and the truth."""
+    """Depth image (m) with the scorer's `meta` and the true components."""
 
     depth_m: Array
     meta: dict[str, Any]
@@ -57,7 +58,7 @@ class MatchingCase:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Tally:
-    """Counts over scenes: per kind found and there, wrong matches, and errors of the right ones."""
+    """Counts over scenes: components found and present per kind, wrong matches, and errors of correct matches."""
 
     found: dict[str, int]
     there: dict[str, int]
@@ -69,23 +70,23 @@ class Tally:
 
     @property
     def recall(self) -> float:
-        """Share of the components that were found."""
+        """Fraction of the components that were found."""
         return sum(self.found.values()) / max(sum(self.there.values()), 1)
 
     @property
     def precision(self) -> float:
-        """Share of the matches that are right."""
+        """Fraction of the matches that are correct."""
         right = sum(self.found.values())
         return right / max(right + len(self.wrong), 1)
 
 
 def empty_tally() -> Tally:
-    """Nothing counted yet."""
+    """Return an empty tally."""
     return Tally(found={}, there={}, wrong=[], place_m=[], angle_rad=[], state_error=[], place_in_sigmas=[])
 
 
 def matching_case(gen: ModuleType, seed: int, *, is_occluded: bool = True, size_px: int = 256) -> MatchingCase:
-    """A panel scene of the generator with a toggle lever, a ball handle and clutter added, boards in front if asked."""
+    """Draw a panel scene of the generator with a toggle lever, a ball handle and clutter, with boards if occluded."""
     rng = np.random.default_rng([seed, sorted(gen.SCENES).index("panel")])
     surfaces, extent, distance = gen.scene_panel(rng)
     plate = surfaces[0]
@@ -122,7 +123,7 @@ def matching_case(gen: ModuleType, seed: int, *, is_occluded: bool = True, size_
 
 
 def _added(gen: ModuleType, rng: np.random.Generator) -> tuple[list[dict[str, Any]], list[Any]]:
-    """A toggle lever, a ball handle, and two things that are in no library, in the panel's frame, millimetres."""
+    """Draw a toggle lever, a ball handle, and two things that are in no library, in the panel frame, millimetres."""
     up = np.array([0.0, 0.0, 1.0])
     lever_at, ball_at = np.array([175.0, 140.0, 0]), np.array([-205.0, 10.0, 0])
     lever_at[:2] += rng.uniform(-4, 4, 2)
@@ -141,7 +142,7 @@ def _added(gen: ModuleType, rng: np.random.Generator) -> tuple[list[dict[str, An
 
 
 def _truth(surfaces: list[dict[str, Any]], camera_from_panel: tuple[Array, Array]) -> list[Any]:
-    """(model, place, yaw, turns, state, name prefixes) of the generator's own components, panel frame, mm."""
+    """Return (model, position, yaw, turns, state, name prefixes) of the generator's components, panel frame, mm."""
     R, t = camera_from_panel
     by_name = {s["name"]: s for s in surfaces}
 
@@ -194,7 +195,7 @@ def _boards(
     truth: list[Any],
     rng: np.random.Generator,
 ) -> list[dict[str, Any]]:
-    """One board a component: it covers 40 % of its pixels, from one side or as a bar across."""
+    """Draw one board per component, which covers 40 % of its pixels, from one side or as a bar across."""
     depth, _ = gen.cast(surfaces, sensor)
     points = gen.points(depth, sensor)
     out = []
@@ -221,7 +222,7 @@ def _boards(
 
 
 def count(case: MatchingCase, matches: tuple[Match, ...], tally: Tally) -> None:
-    """Add the matches of one scene to the tally: each component takes the nearest match of its kind."""
+    """Add the matches of one scene to the tally; each component is assigned the nearest match of its kind."""
     left = list(matches)
     for thing in case.things:
         place = thing.sensor_from_object[:3, 3]
@@ -255,7 +256,7 @@ def _note_errors(thing: Thing, match: Match, tally: Tally) -> None:
 
 
 def _angle(true: Array, found: Array, turns: int) -> float:
-    """Angle between two orientations up to the component's symmetry."""
+    """Return the angle between two orientations, up to the component's symmetry."""
     if turns == 0:
         return float(np.arccos(np.clip(true[:, 2] @ found[:, 2], -1.0, 1.0)))
     angles = []
@@ -267,7 +268,7 @@ def _angle(true: Array, found: Array, turns: int) -> float:
 
 
 def matched(case: MatchingCase) -> tuple[RangeScene, tuple[Match, ...]]:
-    """The scene as analysed and what the shipped library finds in it."""
+    """Analyse the scene; return it with the matches of the shipped library."""
     scene = analyse(case.depth_m, sensor_from_meta(case.meta["sensor"], 1 / MM))
     return scene, match_models(scene, case.depth_m, shipped_models())
 
@@ -275,7 +276,7 @@ def matched(case: MatchingCase) -> tuple[RangeScene, tuple[Match, ...]]:
 def run(
     gen: ModuleType, seeds: range, *, is_occluded: bool, look: Callable[[MatchingCase, Any, Any], None] | None = None
 ) -> Tally:
-    """The tally over scenes."""
+    """Return the tally over all scenes."""
     tally = empty_tally()
     for seed in seeds:
         case = matching_case(gen, seed, is_occluded=is_occluded)
@@ -287,7 +288,7 @@ def run(
 
 
 def main() -> None:
-    """Command line entry; see the module's docstring."""
+    """Run the command line; see the module's docstring."""
     from benchmarks.range import DATA, range_module
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -309,7 +310,7 @@ def main() -> None:
 
 
 def summary(tally: Tally) -> str:
-    """Median and ninth decile of the errors, in words."""
+    """Return the median and the 90th percentile of the errors as text."""
     if not tally.place_m:
         return "nothing found"
     place, angle = np.array(tally.place_m) * MM, np.degrees(tally.angle_rad)

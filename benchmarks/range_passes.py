@@ -42,12 +42,12 @@ WHOLE = "everything"
 
 
 def handing_back(position: int) -> Callable[..., Any]:
-    """A stand-in for a pass, which returns one of its arguments as it was given."""
+    """Return a replacement for a pass that returns one of its arguments unchanged."""
     return lambda *arguments, **_options: arguments[position]
 
 
 def none_joined(_regions: Any, kinds: list[int], _parameters: Any) -> list[int]:
-    """A stand-in for merging and joining: every label stays its own."""
+    """Replace merging and joining: every region keeps its own label."""
     return list(range(1, len(kinds) + 1))
 
 
@@ -67,7 +67,7 @@ PASSES: dict[str, tuple[Replacement, ...]] = {
 
 @dataclass(slots=True, kw_only=True)
 class Tally:
-    """Of each image the regions that are right at 0.8 and 0.9, and found where nothing is; and the processor time."""
+    """Counts per image: regions that are correct at 0.8 and 0.9, regions without a true one, and CPU time."""
 
     right: list[int] = field(default_factory=list)
     strictly_right: list[int] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Tally:
 
 
 def main() -> None:
-    """Command line entry; see the module's docstring."""
+    """Run the command line; see the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--first-seed", type=int, default=3000)
     parser.add_argument("--seeds", type=int, default=20, help="seeds per subject; half as many of the large images")
@@ -103,7 +103,7 @@ def main() -> None:
 
 
 def measured(cases: Iterator[Case]) -> dict[str, Tally]:
-    """Every case analysed as it is and without each pass."""
+    """Analyse every case with all passes and without each pass in turn."""
     tallies = {name: Tally() for name in PASSES}
     for case in cases:
         depth, sensor = case_depth(case, codes="use" in case), sensor_from_meta(case["meta"]["sensor"], 1 / MM)
@@ -120,7 +120,7 @@ def measured(cases: Iterator[Case]) -> dict[str, Tally]:
 
 
 def counted(case: Case, labels: Labels, tolerance: float) -> tuple[int, int]:
-    """Regions of truth that one found region overlaps by `tolerance` of either, and found regions within no one region."""
+    """Return the numbers of true regions that a found one overlaps by `tolerance` of both, and of spurious regions."""
     truth = np.asarray(case["labels"], np.int64)
     columns = int(labels.max()) + 1
     shared = np.bincount((truth * columns + labels).ravel(), minlength=(int(truth.max()) + 1) * columns)
@@ -135,7 +135,7 @@ def counted(case: Case, labels: Labels, tolerance: float) -> tuple[int, int]:
 
 @contextmanager
 def without(name: str) -> Iterator[None]:
-    """The chain without one pass of `PASSES`."""
+    """Run the `with` block without one pass of `PASSES`."""
     with ExitStack() as stack:
         for module, attribute, stand_in in PASSES[name]:
             stack.enter_context(patch.object(module, attribute, stand_in))
@@ -143,7 +143,7 @@ def without(name: str) -> Iterator[None]:
 
 
 def print_rows(subject: str, tallies: dict[str, Tally]) -> None:
-    """One line per pass: what changes when it is left out."""
+    """Print one line per pass: what changes if it is left out."""
     whole = tallies[WHOLE]
     print(f"\n{subject}: {len(whole.right)} images, {sum(whole.right)} and {sum(whole.strictly_right)} regions right,")
     print(f"  {sum(whole.false)} false, {1e3 * whole.seconds / max(len(whole.right), 1):.1f} ms per image")
@@ -162,7 +162,7 @@ def print_rows(subject: str, tallies: dict[str, Tally]) -> None:
 
 
 def drawn(scene: str, **kind: Any) -> Callable[[ModuleType, range], Iterator[Case]]:
-    """Cases of a scene of the development generator; a share `use` of the 8-bit range means that codes are read."""
+    """Return a source of cases of a generator's scene; with `use`, 8-bit codes fill that fraction of their range."""
 
     def cases(gen: ModuleType, numbers: range) -> Iterator[Case]:
         for seed in numbers:
@@ -175,12 +175,12 @@ def drawn(scene: str, **kind: Any) -> Callable[[ModuleType, range], Iterator[Cas
 def seen_by(
     draw: Callable[[ModuleType, str, int], Case], sensors: Sequence[str]
 ) -> Callable[[ModuleType, range], Iterator[Case]]:
-    """Cases of 640x480 pixels that each of the sensors sees, half as many a sensor as there are seeds."""
+    """Return a source of 640x480 cases for each of the sensors, half as many per sensor as there are seeds."""
     return lambda gen, numbers: (draw(gen, s, n) for s in sensors for n in numbers[: (len(numbers) + 1) // 2])
 
 
 def living_room(_gen: ModuleType, _numbers: range) -> Iterator[Case]:
-    """The one frame of the development data that is no drawing and has truth."""
+    """Yield the only real frame of the development data with known truth."""
     with np.load(DATA / "real" / "icl_living_room_0.npz") as data:
         yield {key: data[key] for key in data.files} | {"meta": json.loads(str(data["meta"]))}
 

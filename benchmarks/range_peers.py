@@ -1,6 +1,7 @@
-"""Other people's segmenters on the same images, in the same run: Open3D and pyransac3d, where their wheels are installed.
+"""Third-party segmenters on the same images in the same run: Open3D and pyransac3d, if they are installed.
 
-`pip install -e '.[bench]'` brings them. Each gets the points and answers with labels and primitives, which the same scorer judges.
+`pip install -e '.[bench]'` installs them. Each receives the points and returns labels and primitives, which are judged
+by the same scorer.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 
 Labels = NDArray[np.int32]
-Found = tuple[NDArray[np.bool_], dict[str, Any]]  # which points, and the primitive as the scorer reads it
+Found = tuple[NDArray[np.bool_], dict[str, Any]]  # mask of the points, and the primitive in the scorer's format
 Segmenter = Callable[[ModuleType, Array], Iterator[Found]]
 
 THRESHOLD_MM = 2.0  # four sigmas of the nominal noise
-LEAST_SHARE = 0.005  # of the points: smaller surfaces are not looked for
+LEAST_SHARE = 0.005  # smallest surface searched for, as a fraction of all points
 MOST_SURFACES = 12
 OPEN3D_TRIES, PYRANSAC_TRIES = 500, 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PeerResult:
-    """Regions that a peer has correct at T = 0.8, of how many, and the median time of an image."""
+    """Result of a peer: correct regions at T = 0.8, all regions, and median time per image."""
 
     name: str
     correct: int
@@ -41,7 +42,7 @@ class PeerResult:
 
 
 def peer_results(score: ModuleType, cases: Sequence[tuple[dict[str, Any], Array]]) -> list[PeerResult]:
-    """Every installed peer on every case: the generator's case and its (H, W, 3) points in mm, NaN where none is."""
+    """Run every installed peer on every case: a case of the generator with its (H, W, 3) points in mm, NaN for none."""
     peers: tuple[tuple[str, str, Segmenter], ...] = (
         ("Open3D RANSAC planes", "open3d", _open3d_planes),
         ("Open3D planar patches", "open3d", _open3d_patches),
@@ -63,7 +64,7 @@ def _judged(
 ) -> PeerResult:
     rows, times = [], []
     for case, points in cases:
-        random.seed(0)  # pyransac3d draws from it
+        random.seed(0)  # used by pyransac3d
         started = time.perf_counter()
         labels, primitives = _labelled(segmenter, module, points)
         times.append(1e3 * (time.perf_counter() - started))
@@ -73,7 +74,7 @@ def _judged(
 
 
 def _labelled(segmenter: Segmenter, module: ModuleType, points: Array) -> tuple[Labels, list[dict[str, Any]]]:
-    """Labels of what a segmenter finds; a surface in several parts of the image is as many regions."""
+    """Return labels of what a segmenter finds; a surface with several parts in the image is split into regions."""
     valid = np.isfinite(points).all(axis=2)
     labels = np.zeros(valid.shape, np.int32)
     primitives: list[dict[str, Any]] = []
@@ -90,7 +91,7 @@ def _labelled(segmenter: Segmenter, module: ModuleType, points: Array) -> tuple[
 
 
 def _greedy(points: Array, largest: Callable[[Array], tuple[NDArray[np.intp], dict[str, Any]]]) -> Iterator[Found]:
-    """The surface with the most points, then that of what is left, until little is left."""
+    """Yield the surface with the most points, then the largest of the remaining points, until few points remain."""
     left = np.arange(len(points))
     for _ in range(MOST_SURFACES):
         if len(left) < max(16, LEAST_SHARE * len(points)):
@@ -150,6 +151,6 @@ def _pyransac3d(pyransac3d: ModuleType, points: Array) -> Iterator[Found]:
 
 
 def _plane(equation: Array) -> dict[str, Any]:
-    """The scorer's plane of (4,) a, b, c, d with a x + b y + c z + d = 0."""
+    """Return the plane (4,) a, b, c, d with a x + b y + c z + d = 0 in the scorer's format."""
     normal = equation[:3]
     return {"type": "plane", "n": normal.tolist(), "c": (-equation[3] * normal / (normal @ normal)).tolist()}

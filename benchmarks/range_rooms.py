@@ -1,8 +1,8 @@
-"""Furnished rooms as depth cameras see them: walls, soft furniture, shelves, tables and what stands on them.
+"""Simulated depth images of furnished rooms: walls, soft furniture, shelves, tables and things on them.
 
-A stand-in for real frames of rooms, whose labels it follows: rounded edges beyond 5 mm and loose cushions bear no label,
-faces that bulge by a hundredth are planes, each cushion of a sofa has its own, what an occluder parts keeps one, and
-nobody outlines skirting boards, picture frames, edges of boards and poles.
+They replace real frames of rooms and follow their way of labelling: rounded edges beyond 5 mm and loose cushions have
+no label, faces that bulge by 1 % are planes, each cushion of a sofa has its own label, a surface that an occluder
+divides keeps one label, and skirting boards, picture frames, edges of boards and poles are not outlined.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from benchmarks.range_soft import STRAIGHT, UP, SoftBox, drawn, plane, sofa, sof
 from hal.arrays import Array
 
 VIEWS = ("structured", "tof", FINE)
-NARROWEST_MM = 50.0  # a face that anybody outlines
-OFF_WALL_MM = 600.0  # the camera stays
+NARROWEST_MM = 50.0  # narrowest face that people outline
+OFF_WALL_MM = 600.0  # least distance of the camera from the walls
 GAP_MM = (60.0, 250.0)  # between pieces of furniture
 
 
 @dataclass(slots=True, kw_only=True)
 class Room:
-    """What stands in a room, millimetres: the back wall is y = 0, the floor z = 0, the camera at negative y.
+    """Contents of a room, in millimetres: the back wall is y = 0, the floor z = 0, the camera is at negative y.
 
     Attributes:
-        gen, rng: the builders of primitives, and the draw.
+        gen, rng: generator module that builds primitives, and the random generator.
         plain: primitives as `gen` draws them.
         soft: boxes with rounded edges and bulged faces.
     """
@@ -40,26 +40,26 @@ class Room:
     soft: list[SoftBox] = field(default_factory=list)
 
     def between(self, low: float, high: float) -> float:
-        """A number drawn between two."""
+        """Return a random number between two."""
         return float(self.rng.uniform(low, high))
 
     def box(self, name: str, at: Any, size: Any, turn: Array = STRAIGHT) -> None:
-        """A sharp box of `size` that stands centred on the point `at`."""
+        """Add a box of `size` with sharp edges that stands centred on the point `at`."""
         size = np.asarray(size, float)
         self.plain += self.gen.box(np.asarray(at, float) + UP * (size[2] / 2), size, turn, name)
 
     def carton(self, name: str, at: Any, size: Any, turn: Array, radius: float, bulge: float) -> None:
-        """A soft box of `size` that stands centred on the point `at`."""
+        """Add a soft box of `size` that stands centred on the point `at`."""
         centre = np.asarray(at, float) + UP * (size[2] / 2)
         self.soft.append(soft_box(self.rng, name, centre, size, turn, radius, bulge))
 
     def can(self, name: str, at: Any, radius: float, height: float) -> None:
-        """A cylinder that stands on the point `at`."""
+        """Add a cylinder that stands on the point `at`."""
         self.plain += self.gen.cyl(np.asarray(at, float) + UP * (height / 2), UP, radius, height / 2, name)
 
 
 def room(gen: ModuleType, sensor: str, seed: int) -> Case:
-    """A case in the scorer's form: a room seen by one of `VIEWS`."""
+    """Return a case in the scorer's format: a room seen by one of `VIEWS`."""
     rng = np.random.default_rng([seed, VIEWS.index(sensor), 79])
     place = Room(gen=gen, rng=rng)
     half_width = rng.uniform(1500, 2300)
@@ -75,7 +75,7 @@ def room(gen: ModuleType, sensor: str, seed: int) -> Case:
 
 
 def _seen(place: Room, R: Array, t: Array, sensor: str, seed: int) -> Case:
-    """The room as the camera at camera_from_room (`R`, `t`) sees it."""
+    """Return the room as the camera at camera_from_room (`R`, `t`) sees it."""
     gen, model = place.gen, sensor_model(sensor)
     surfaces = list(gen.to_camera(place.plain, R, t))
     clean, labels = gen.cast(surfaces, model)
@@ -88,7 +88,7 @@ def _seen(place: Room, R: Array, t: Array, sensor: str, seed: int) -> Case:
 
 
 def _is_trim(surface: dict[str, Any]) -> bool:
-    """Whether nobody would outline it: too narrow a face, too thin a pole."""
+    """Return whether people would not outline the surface, because it is too narrow a face or too thin a pole."""
     clip = surface.get("clip") or {}
     if clip.get("kind") == "rect":
         return bool(2 * min(clip["a"], clip["b"]) < NARROWEST_MM)
@@ -96,7 +96,7 @@ def _is_trim(surface: dict[str, Any]) -> bool:
 
 
 def _shell(place: Room, half_width: float) -> None:
-    """Floor, walls, ceiling, skirting boards, and a picture or two."""
+    """Add floor, walls, ceiling, skirting boards, and one or two pictures."""
     height = place.between(2400, 2800)
     place.plain += [
         plane("floor", UP, [0, 0, 0]),
@@ -115,7 +115,7 @@ def _shell(place: Room, half_width: float) -> None:
 
 
 def _frame(place: Room, name: str, at: Array, size: Array) -> None:
-    """Four strips around a picture, before it."""
+    """Add four strips around a picture, in front of it."""
     thick, wide = 35.0, 40.0
     for side in (-1, 1):
         beside = np.array([side * size[0] / 2, -5, 0])
@@ -125,7 +125,7 @@ def _frame(place: Room, name: str, at: Array, size: Array) -> None:
 
 
 def _furnish(place: Room, half_width: float) -> None:
-    """Pieces along the wall from left to right while there is room, and things that stand free before them."""
+    """Add furniture along the wall from left to right while there is space, and free-standing things in front of it."""
     pieces: list[Callable[[Room, float], float]] = [_sofa, _cabinet, _shelf, _desk, _armchair, _lamp]
     at = -half_width + place.between(*GAP_MM)
     for k in place.rng.permutation(len(pieces)):
@@ -142,8 +142,8 @@ def _furnish(place: Room, half_width: float) -> None:
         place.carton(f"carton{k}", at_floor, size, turn, place.between(4, 12), place.between(0.004, 0.015))
 
 
-# Each piece stands at the wall with its left side at x = `left` (mm) and returns its width; one too wide for
-# what is left of the wall goes into it, where no camera sees it.
+# Each function adds furniture at the wall with its left side at x = `left` (mm) and returns the width. Furniture that
+# is too wide for the rest of the wall extends into the side wall, where no camera sees it.
 
 
 def _sofa(place: Room, left: float, *, is_single: bool = False) -> float:
@@ -158,7 +158,7 @@ def _armchair(place: Room, left: float) -> float:
 
 
 def _cabinet(place: Room, left: float) -> float:
-    """A plain box with things on top."""
+    """Add a plain box with things on top."""
     width, depth, height = place.between(500, 1200), place.between(350, 480), place.between(450, 1100)
     place.box("cabinet", [left + width / 2, -depth / 2, 0], [width, depth, height])
     _things(place, [left + width / 2, -depth / 2, height], width, depth, "cabinet")
@@ -166,7 +166,7 @@ def _cabinet(place: Room, left: float) -> float:
 
 
 def _shelf(place: Room, left: float) -> float:
-    """Sides, back and boards, before any picture, with cartons and cans between them."""
+    """Add a shelf with sides, back and boards, in front of any picture, with cartons and cans on the boards."""
     width, depth, height = place.between(600, 1100), place.between(280, 380), place.between(1200, 1900)
     boards, thick, off_wall = int(place.rng.integers(3, 6)), 22.0, 60.0
     x, y = left + width / 2, -off_wall - depth / 2
@@ -182,7 +182,7 @@ def _shelf(place: Room, left: float) -> float:
 
 
 def _desk(place: Room, left: float) -> float:
-    """A table against the wall, a screen on it and things beside it."""
+    """Add a table at the wall with a screen on it and things beside it."""
     width, depth = place.between(900, 1500), place.between(550, 800)
     _table(
         place, "desk", np.array([left + width / 2, -depth / 2 - 20, 0]), [width, depth, place.between(690, 760)], 0.0
@@ -197,7 +197,7 @@ def _coffee_table(place: Room) -> None:
 
 
 def _table(place: Room, name: str, at: Array, size: list[float], angle: float) -> None:
-    """A board of `size` on four legs, turned by `angle`, with things on it."""
+    """Add a board of `size` on four legs, rotated by `angle`, with things on it."""
     turn, thick, leg = place.gen.Rz(angle), place.between(18, 40), place.between(35, 48)
     for i in (-1, 1):
         for j in (-1, 1):
@@ -208,7 +208,7 @@ def _table(place: Room, name: str, at: Array, size: list[float], angle: float) -
 
 
 def _lamp(place: Room, left: float) -> float:
-    """A floor lamp: a foot, a pole, and a shade that is a cylinder, a frustum or a ball."""
+    """Add a floor lamp: a foot, a pole, and a shade that is a cylinder, a frustum or a ball."""
     radius, height = place.between(130, 220), place.between(1200, 1600)
     at = np.array([left + radius, -radius - 100, 0.0])
     place.can("lamp:foot", at, 140, 25)
@@ -224,7 +224,7 @@ def _lamp(place: Room, left: float) -> float:
 
 
 def _things(place: Room, at: Any, width: float, depth: float, name: str, tallest: float = 400.0) -> None:
-    """Boxes, mugs, bottles and balls in cells of a surface `width` by `depth` around the point `at`, none touching."""
+    """Add boxes, mugs, bottles and balls that do not touch, on a surface `width` by `depth` around the point `at`."""
     cell = 190.0
     count = int(width // cell)
     for k in range(count):

@@ -52,7 +52,7 @@ WORKERS = (1, 2, 4, 16, 64, 256, 1024)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Path1:
-    """Critical path of one image for a number of tiles, seconds: with shared memory and with messages."""
+    """Critical path of one image for a number of tiles, in seconds: with shared memory and with messages."""
 
     tiles: int
     shared_s: float
@@ -60,7 +60,7 @@ class Path1:
 
 
 def main() -> None:
-    """Command line entry; see the module's docstring."""
+    """Run the command line; see the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, help="recordings for the batch part; made up when not given")
     parser.add_argument("--images", type=int, default=240, help="made-up recordings")
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def made_up_scene(side: int, seed: int) -> tuple[Array, PinholeSensor]:
-    """A tilted wall with balls and pipes in front, noise of half a millimetre: depth (side, side) and its sensor."""
+    """Draw a tilted wall with balls and pipes in front, 0.5 mm noise; return depth (side, side) and its sensor."""
     rng = np.random.default_rng(seed)
     f = 1.2 * side
     sensor = PinholeSensor(width_px=side, height_px=side, fx_px=f, fy_px=f, cx_px=(side - 1) / 2, cy_px=(side - 1) / 2)
@@ -94,7 +94,7 @@ def made_up_scene(side: int, seed: int) -> tuple[Array, PinholeSensor]:
 
 
 def make_recordings(folder: Path, count: int) -> None:
-    """Write `count` made-up npz recordings of 256 x 256 pixels."""
+    """Write `count` synthetic npz recordings of 256 x 256 pixels."""
     for k in range(count):
         depth, sensor = made_up_scene(256, k)
         view = {"kind": "pinhole", "shape": [256, 256], "f": sensor.fx_px, "cx": sensor.cx_px, "cy": sensor.cy_px}
@@ -103,14 +103,14 @@ def make_recordings(folder: Path, count: int) -> None:
 
 
 def critical_paths(side: int, repeats: int = 5) -> tuple[list[Path1], float]:
-    """Critical paths for `TILES`, and the time of one image on one tile, seconds."""
+    """Return the critical paths for `TILES`, and the time of one image on one tile, in seconds."""
     depth, sensor = made_up_scene(side, 0)
     scene = analyse(depth, sensor)
     steps = _tiled_steps(depth, sensor, scene.labels)
     one = {tiles: [_slowest_tile(step, side, tiles, repeats) for step in steps] for tiles in TILES}
     whole = _median_s(lambda: analyse(depth, sensor), 3 if side > 1000 else 7)
     rest = max(whole - sum(one[1]), 0.0)
-    # Fits run over regions, not rows: they share out evenly until each worker holds one region.
+    # Fits run over regions, not rows; they are distributed evenly until each worker has one region.
     regions = max(len(scene.surfaces), 1)
     out = []
     for tiles in TILES:
@@ -125,7 +125,7 @@ def critical_paths(side: int, repeats: int = 5) -> tuple[list[Path1], float]:
 
 
 def _tiled_steps(depth: Array, sensor: PinholeSensor, labels: NDArray[np.int32]) -> list[Callable[[int, int], object]]:
-    """The pixel steps of the chain as functions of a row range."""
+    """Return the pixel steps of the chain as functions of a row range."""
     packed, law = sensor.packed(), estimate_noise(depth, sensor).packed()
     H, W = depth.shape
     h, w = H // 2, W // 2
@@ -191,7 +191,7 @@ def print_tiles(side: int) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cluster:
-    """What the simulation knows: cost of handing over a task, start of a worker, stragglers, and a loss.
+    """Parameters of the simulation: times to hand over a task and to start a worker, stragglers, and a lost worker.
 
     A straggling task takes `straggle_factor` times as long with probability `straggle_share`. Worker 0 is lost at
     `lost_at_s` when that is finite; its running task starts again elsewhere after `notice_s`.
@@ -206,9 +206,9 @@ class Cluster:
 
 
 def simulate(task_s: Array, cluster: Cluster, *, seed: int = 0) -> float:
-    """Makespan in seconds of serving tasks of the given lengths (N,) first come, first served.
+    """Return the makespan in seconds for tasks of the given lengths (N,), served first come, first served.
 
-    The scheduler hands over one task at a time, so `handover_s` bounds how many workers it can feed.
+    The scheduler hands over one task at a time, so `handover_s` limits how many workers it can keep busy.
     """
     rng = np.random.default_rng(seed)
     slow = rng.random(task_s.size) < cluster.straggle_share
@@ -225,7 +225,7 @@ def simulate(task_s: Array, cluster: Cluster, *, seed: int = 0) -> float:
         scheduler_free = start
         end = start + float(lengths[task])
         if worker == 0 and end > cluster.lost_at_s:
-            # The worker is gone for good; its task comes back once the silence is noticed.
+            # The worker does not return; its task is rescheduled when the loss is noticed.
             heapq.heappush(waiting, (max(cluster.lost_at_s, start) + cluster.notice_s, task))
             continue
         makespan = max(makespan, end)
@@ -235,7 +235,7 @@ def simulate(task_s: Array, cluster: Cluster, *, seed: int = 0) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskRun:
-    """One task as its worker saw it: process id, wall clock at start and end, and CPU time, seconds."""
+    """One task as measured by its worker: process id, wall clock at start and end, and CPU time, in seconds."""
 
     worker: int
     start_s: float
@@ -244,14 +244,14 @@ class TaskRun:
 
 
 def stamped(paths: Sequence[str]) -> TaskRun:
-    """`analyse_files` of one group of recordings, timed where it runs."""
+    """Run `analyse_files` on one group of recordings and time it in the worker."""
     start_s, cpu_s = time.time(), time.process_time()
     analyse_files(paths)
     return TaskRun(worker=os.getpid(), start_s=start_s, end_s=time.time(), cpu_s=time.process_time() - cpu_s)
 
 
 def measured_batch(groups: list[list[str]], workers: int) -> list[TaskRun]:
-    """The tasks of a batch on that many warm local workers, in the order in which they started."""
+    """Return the tasks of a batch run on `workers` warm local workers, in the order in which they started."""
     with _client("local", workers) as client:
         client.run(warm_up)
         runs: list[TaskRun] = client.gather(client.map(stamped, groups, pure=False))
@@ -259,7 +259,7 @@ def measured_batch(groups: list[list[str]], workers: int) -> list[TaskRun]:
 
 
 def gaps_s(runs: Sequence[TaskRun]) -> Array:
-    """Seconds between the end of a task and the start of the next on the same worker: what handing over costs."""
+    """Return the seconds between the end of a task and the start of the next on the same worker, the hand-over time."""
     last: dict[int, float] = {}
     out = []
     for run in runs:
@@ -272,8 +272,8 @@ def gaps_s(runs: Sequence[TaskRun]) -> Array:
 def print_batch(folder: Path) -> None:
     """Print measured runs with one and two workers beside the simulation, then the simulation up to 1024 workers.
 
-    The simulation gets the lengths of the tasks as they were in that run, so that other load on the machine does not
-    count, and the hand-over of the run with one worker; it must find when the last task ends.
+    The simulation uses the task lengths of the same run, so that other load on the machine does not count, and the
+    hand-over time of the run with one worker; it must predict when the last task ends.
     """
     groups = tasks_of(recordings_in(folder))
     images = sum(len(g) for g in groups)
@@ -301,9 +301,9 @@ def print_batch(folder: Path) -> None:
 
 
 def print_carried(lengths: Array, handover_s: float) -> None:
-    """Print simulated makespans of 200 000 images: plain, with stragglers, and with one worker lost half way."""
+    """Print simulated makespans of 200 000 images: plain, with stragglers, and with one worker lost halfway."""
     many = np.random.default_rng(0).choice(lengths, 10_000)
-    network_s = min(handover_s, 0.0005)  # 200 to 500 us a task on a running scheduler that nothing else disturbs
+    network_s = min(handover_s, 0.0005)  # an undisturbed scheduler needs 200 to 500 us per task
     print(f"\nsimulated, 10000 tasks, {1e3 * network_s:.2f} ms a hand-over")
     print(f"{'workers':>8} {'plain s':>9} {'efficiency':>11} {'2 % stragglers x3':>18} {'one lost':>9}")
     for workers in WORKERS:

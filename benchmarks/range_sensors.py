@@ -1,8 +1,9 @@
-"""Depth images as real sensors give them: structured light, stereo and time of flight, over exact scenes.
+"""Simulates the errors of real depth sensors on exact scenes: structured light, stereo and time of flight.
 
-White noise flatters: real depth is correlated over a matching window, stepped in disparity, bent by calibration, ragged
-and blind beside jumps. Amplitudes and correlation lengths were measured on flat patches of the development frames:
-structured light scatters by 0.07 px of disparity over 4 to 6 px, stereo by less over 8 px.
+White noise would be too favourable: real depth errors are correlated over the matching window, quantised in disparity
+and distorted by calibration, and beside depth jumps the image is ragged or empty. Amplitudes and correlation lengths
+were measured on flat patches of the development frames: structured light has 0.07 px of disparity noise correlated over
+4 to 6 px, stereo less noise, over 8 px.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from hal.arrays import Array
 Case = dict[str, Any]
 
 SHAPE = (480, 640)
-LEAST_PIXELS = 400  # of a scored surface: a person who outlines surfaces by hand draws no smaller ones
+LEAST_PIXELS = 400  # of a scored surface; people who outline surfaces by hand omit smaller ones
 SENSORS = ("structured", "stereo", "tof")
-FINE = "fine"  # a sensor whose errors are far smaller than those of any real face: scanned or rendered depth
+FINE = "fine"  # sensor with errors far smaller than the unevenness of real faces: scanned or rendered depth
 TABLE_HEIGHT_MM = 720.0
 
 
 def table_top(gen: ModuleType, sensor: str, seed: int) -> Case:
-    """A case in the scorer's form: boxes, cans and balls on a table, seen by one of `SENSORS` as if at hand's distance."""
+    """Return a case in the scorer's format: boxes, cans and balls on a table, seen closely by one of `SENSORS`."""
     rng = np.random.default_rng([seed, SENSORS.index(sensor), 77])
     surfaces = _objects(gen, rng)
     clean, labels = gen.cast(surfaces, sensor_model(sensor))
@@ -46,7 +47,7 @@ def case_seen(
     scene: str,
     seed: int,
 ) -> Case:
-    """A case in the scorer's form of exact depth in millimetres, not finite where nothing is, degraded by a sensor."""
+    """Return a case in the scorer's format: exact depth in millimetres (not finite for none), degraded by a sensor."""
     model = sensor_model(sensor)
     truth = np.where(np.isfinite(clean), labels, 0)
     depth = DEGRADE[sensor](clean, model["f"], rng)
@@ -67,13 +68,13 @@ def case_seen(
 
 
 def sensor_model(sensor: str) -> dict[str, Any]:
-    """The pinhole of one of `SENSORS` as the case format writes it."""
+    """Return the pinhole model of one of `SENSORS` in the case format."""
     focal = {"structured": 575.0, "stereo": 900.0, "tof": 500.0, "fine": 500.0}[sensor]
     return {"kind": "pinhole", "shape": list(SHAPE), "f": focal, "cx": 319.5, "cy": 239.5}
 
 
 def _objects(gen: ModuleType, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Surfaces in the camera's frame, millimetres: floor, wall, table and four to eight things on it."""
+    """Draw surfaces in the camera frame, millimetres: floor, wall, table and four to eight things on it."""
     up = np.array([0.0, 0.0, 1.0])
     floor = dict(type="plane", name="floor", n=up, c=np.array([0.0, 0.0, -TABLE_HEIGHT_MM]))
     wall = dict(type="plane", name="wall", n=np.array([0.0, -1.0, 0.0]), c=np.array([0.0, rng.uniform(900, 1600), 0.0]))
@@ -89,7 +90,7 @@ def _objects(gen: ModuleType, rng: np.random.Generator) -> list[dict[str, Any]]:
 
 
 def stands(rng: np.random.Generator) -> Iterator[Array]:
-    """Four to eight places (3,) on a table at z = 0 where things stand without touching."""
+    """Yield four to eight positions (3,) on a table at z = 0 where things stand without touching."""
     cells = [(x, y) for x in (-260, -90, 90, 260) for y in (-140, 60, 240)]
     rng.shuffle(cells)
     for x, y in cells[: rng.integers(4, 9)]:
@@ -102,7 +103,7 @@ def _thing(gen: ModuleType, rng: np.random.Generator, at: Array, k: int) -> list
     if choice < 0.6:
         size = rng.uniform([60, 60, 40], [170, 150, 230])
         out = list(gen.box(at + up * (size[2] / 2), size, turn, f"box{k}"))
-        if rng.random() < 0.25:  # a second one on top
+        if rng.random() < 0.25:  # a second box on top
             top = rng.uniform([40, 40, 40], [100, 90, 120])
             out += gen.box(at + up * (size[2] + top[2] / 2), top, gen.Rz(rng.uniform(0, np.pi)), f"upper{k}")
         return out
@@ -117,7 +118,7 @@ def _thing(gen: ModuleType, rng: np.random.Generator, at: Array, k: int) -> list
 
 
 def structured_light(clean_mm: Array, focal_px: float, rng: np.random.Generator) -> Array:
-    """Pattern projector 75 mm beside the camera, disparity in eighths of a pixel (Khoshelham and Elberink 2012)."""
+    """Simulate a pattern projector 75 mm beside the camera, with disparity in 1/8 px (Khoshelham and Elberink 2012)."""
     return _triangulated(
         clean_mm,
         rng,
@@ -131,7 +132,7 @@ def structured_light(clean_mm: Array, focal_px: float, rng: np.random.Generator)
 
 
 def stereo(clean_mm: Array, focal_px: float, rng: np.random.Generator) -> Array:
-    """Two cameras 90 mm apart, disparity in sixteenths, smoothed by a large matching window."""
+    """Simulate two cameras 90 mm apart, with disparity in 1/16 px, smoothed by a large matching window."""
     return _triangulated(
         clean_mm,
         rng,
@@ -145,7 +146,7 @@ def stereo(clean_mm: Array, focal_px: float, rng: np.random.Generator) -> Array:
 
 
 def time_of_flight(clean_mm: Array, focal_px: float, rng: np.random.Generator) -> Array:
-    """Modulated light: noise grows with z^2, flying pixels at jumps, distance wiggles by a few millimetres."""
+    """Simulate modulated light: noise grows with z^2, flying pixels at jumps, periodic errors of a few millimetres."""
     del focal_px
     z = np.nan_to_num(clean_mm, posinf=0.0)
     mixed = cv2.blur(z, (3, 3))
@@ -160,7 +161,7 @@ def time_of_flight(clean_mm: Array, focal_px: float, rng: np.random.Generator) -
 
 
 def fine(clean_mm: Array, focal_px: float, rng: np.random.Generator) -> Array:
-    """A slow scanner, or a rendering: a third of a millimetre of white noise, whole millimetres."""
+    """Simulate a slow scanner or a rendering: 1/3 mm of white noise, rounded to millimetres."""
     del focal_px
     out = np.rint(clean_mm + rng.normal(0.0, 0.3, clean_mm.shape))
     out[~np.isfinite(clean_mm)] = np.nan
@@ -178,13 +179,13 @@ def _triangulated(
     bend_px: float,
     ragged_px: float,
 ) -> Array:
-    """Depth from noisy, bent, stepped disparity, blind where the second viewpoint is and ragged at jumps."""
+    """Return depth from noisy, distorted, quantised disparity, ragged at jumps, empty where hidden from one view."""
     H, W = clean_mm.shape
     v, u = np.mgrid[:H, :W].astype(np.float32)
     shift = [np.asarray(ragged_px * _field(rng, 3.0), np.float32) for _ in range(2)]
     z = np.where(np.isfinite(clean_mm), clean_mm, 1e5).astype(np.float32)
     moved = cv2.remap(z, u + shift[0], v + shift[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    # Only jumps are ragged: over a slanted face the matching window averages.
+    # Only jumps are ragged; on a slanted face the matching window averages.
     z_mm = np.asarray(np.where(np.abs(moved - z) > 0.02 * z, moved, z), np.float64)
     disparity = np.asarray(base_px_mm / z_mm, np.float64)
     x, y = u / W - 0.5, v / H - 0.5
@@ -202,7 +203,7 @@ def _triangulated(
 
 
 def _field(rng: np.random.Generator, sigma_px: float) -> Array:
-    """Smooth random field of unit standard deviation, correlated as a gaussian of `sigma_px`."""
+    """Return a smooth random field of unit standard deviation, correlated by a Gaussian of `sigma_px`."""
     scale = max(1, int(sigma_px / 3))
     small = rng.normal(size=(SHAPE[0] // scale + 16, SHAPE[1] // scale + 16))
     smooth = cv2.GaussianBlur(small, (0, 0), sigma_px / scale)
@@ -211,10 +212,10 @@ def _field(rng: np.random.Generator, sigma_px: float) -> Array:
 
 
 def _unseen_by_second(disparity_px: Array) -> NDArray[np.bool_]:
-    """Pixels whose ray to the second viewpoint something nearer, farther right in the image, cuts."""
+    """Return the pixels that a nearer surface, further right in the image, hides from the second viewpoint."""
     H, W = disparity_px.shape
     column = np.arange(W)[None, :] - disparity_px
-    # A point to the right that maps at or left of mine hides me: running minimum from the right.
+    # A pixel is hidden if one to its right maps at or left of it, hence a running minimum from the right.
     least = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
     hidden = np.zeros((H, W), bool)
     hidden[:, :-1] = least[:, 1:] < column[:, :-1] - 0.7
@@ -222,7 +223,7 @@ def _unseen_by_second(disparity_px: Array) -> NDArray[np.bool_]:
 
 
 def _grazing(z_mm: Array, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Surfaces seen at a slant above about 75 degrees, and some dark patches, return no pattern."""
+    """Return the pixels that reflect no pattern: surfaces slanted by more than about 75 degrees, some dark patches."""
     du, dv = np.abs(np.gradient(z_mm, axis=1)), np.abs(np.gradient(z_mm, axis=0))
     steep = cv2.medianBlur((np.maximum(du, dv) > 0.007 * z_mm).astype(np.uint8), 5) > 0
     return np.asarray(steep | (_field(rng, 6.0) > 3.6))

@@ -1,9 +1,9 @@
-"""Scenes as real things are: faces that bulge, edges that are rounded, upholstery and cushions, seen by depth sensors.
+"""Depth images of scenes with the imperfections of real things: bulging faces, rounded edges, upholstery and cushions.
 
-No face of a cardboard box or a sofa is a plane, and no edge is sharp; a person who outlines surfaces draws one all the
-same. Boxes are signed distance fields: a box rounded by a radius, each face displaced by a low polynomial that is zero
-on its outline, so that the box stays closed. Rays walk along the distance (Hart 1996). The truth is the face that a
-point of a rounded edge is nearest to. Throw cushions are superellipsoids and occlude only: no primitive is theirs.
+No face of a cardboard box or a sofa is an exact plane and no edge is sharp, but people who outline surfaces label them
+as planes. Boxes are signed distance fields: a box with rounded edges, each face displaced by a polynomial of low degree
+that is zero on its outline, so that the box stays closed. Rays are traced by sphere tracing (Hart 1996). A point of a
+rounded edge belongs to the nearest face. Throw cushions are superellipsoids that only occlude and have no label.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from hal.arrays import Array
 
 SCENES = ("table", "room")
 WALK_STEPS = 90
-WALK_SHARE = 0.8  # of the distance: displaced faces are up to a fifth nearer than the box's field says
+WALK_SHARE = 0.8  # step per distance; displaced faces are up to a fifth nearer than the box's distance field
 HIT_MM = 0.02
-EDGE_MM = 5.0  # as far below a face its label still goes, where edges bear none
+EDGE_MM = 5.0  # depth below a face up to which its label reaches, if edges have no label
 VIEWS = (*SENSORS, FINE)
 UP = np.array([0.0, 0.0, 1.0])
 STRAIGHT = np.eye(3)
@@ -30,16 +30,16 @@ STRAIGHT = np.eye(3)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SoftBox:
-    """A rounded box with bulged faces, in millimetres.
+    """Box with rounded edges and bulging faces, in millimetres.
 
     Attributes:
-        name: of the thing; faces are called `name:x+` and so on.
+        name: name of the thing; its faces are called `name:x+` and so on.
         centre, turn: centre (3,) and rotation world_from_box (3, 3).
         half: half of the outer size (3,).
-        radius: of the edges.
-        bulge: (6, 4) of each face x+, x-, y+ ...: displacement (b0 + b1 s + b2 t + b3 s t)(1 - s^2)(1 - t^2) along its
-            normal at face coordinates s, t in -1 .. 1.
-        is_cushion: a superellipsoid of exponents 4 and 2 instead.
+        radius: radius of the edges.
+        bulge: (6, 4) coefficients of each face x+, x-, y+ ...: the displacement along its normal is
+            (b0 + b1 s + b2 t + b3 s t)(1 - s^2)(1 - t^2) at face coordinates s, t in -1 .. 1.
+        is_cushion: whether it is a superellipsoid of exponents 4 and 2 instead.
     """
 
     name: str
@@ -51,11 +51,11 @@ class SoftBox:
     is_cushion: bool = False
 
     def moved(self, R: Array, t: Array) -> SoftBox:
-        """The box in another frame: x -> R x + t."""
+        """Return the box in another frame: x -> R x + t."""
         return replace(self, centre=R @ self.centre + t, turn=R @ self.turn)
 
     def distance(self, p: Array) -> Array:
-        """(N,) distances of the points (N, 3) in the box's frame, a lower bound outside up to `WALK_SHARE`."""
+        """Return (N,) distances of points (N, 3) in the box's frame; outside, `WALK_SHARE` of them is a lower bound."""
         if self.is_cushion:
             r = np.sqrt((p[:, 0] / self.half[0]) ** 4 + (p[:, 1] / self.half[1]) ** 4) + (p[:, 2] / self.half[2]) ** 2
             return np.asarray((np.sqrt(r) - 1.0) * self.half.min())
@@ -64,14 +64,14 @@ class SoftBox:
         return np.asarray(outside + np.minimum(q.max(axis=1), 0.0) - self.radius - self._displacement(p))
 
     def faces(self, p: Array) -> NDArray[np.int64]:
-        """(N,) face 0 to 5 that each surface point (N, 3) in the box's frame is nearest to; 0 for a cushion."""
+        """Return the nearest face (N,), 0 to 5, of surface points (N, 3) in the box's frame; 0 for a cushion."""
         if self.is_cushion:
             return np.zeros(len(p), np.int64)
         axis = (np.abs(p) - self.half).argmax(axis=1)
         return np.asarray(2 * axis + (p[np.arange(len(p)), axis] < 0))
 
     def is_edge(self, p: Array) -> NDArray[np.bool_]:
-        """(N,) whether each surface point (N, 3) in the box's frame is rounded off its face by more than `EDGE_MM`."""
+        """Return (N,) whether surface points (N, 3) in the box's frame are more than `EDGE_MM` below their face."""
         q = np.abs(p) - self.half
         is_rounded = (q > -self.radius).sum(axis=1) > 1
         return np.asarray(is_rounded & (q.max(axis=1) < -EDGE_MM) & (not self.is_cushion))
@@ -86,7 +86,7 @@ class SoftBox:
 
 
 def soft_scene(gen: ModuleType, scene: str, sensor: str, seed: int) -> Case:
-    """A case in the scorer's form: one of `SCENES` seen by one of `VIEWS`."""
+    """Return a case in the scorer's format: one of `SCENES` seen by one of `VIEWS`."""
     rng = np.random.default_rng([seed, VIEWS.index(sensor), SCENES.index(scene), 78])
     plain, soft, target, distance = _table(gen, rng) if scene == "table" else _room(gen, rng)
     R, t = gen.look(
@@ -100,7 +100,7 @@ def soft_scene(gen: ModuleType, scene: str, sensor: str, seed: int) -> Case:
     clean = np.where(np.isfinite(clean), clean, np.inf)
     for box in soft:
         surfaces += drawn(gen, box.moved(R, t), model, clean, labels, len(surfaces))
-    # Slivers of faces that end at an outline: nobody draws them, and each would turn the face it lies in into two.
+    # Narrow remains of faces at an outline: people do not draw them, and each would divide the face around it.
     labels = np.where(np.bincount(labels.ravel())[labels] >= LEAST_PIXELS // 4, labels, 0)
     return case_seen(clean, labels, surfaces, sensor=sensor, rng=rng, scene=f"soft_{scene}", seed=seed)
 
@@ -108,7 +108,7 @@ def soft_scene(gen: ModuleType, scene: str, sensor: str, seed: int) -> Case:
 def soft_box(
     rng: np.random.Generator, name: str, centre: Array, size: Array, turn: Array, radius: float, bulge: float
 ) -> SoftBox:
-    """A box of outer `size` whose faces bulge by `bulge` times their extent, outwards more often than inwards."""
+    """Draw a box of outer `size` with faces that bulge by `bulge` times their extent, mostly outwards."""
     size = np.asarray(size, float)
     extent = np.array([min(size[(k // 2 + 1) % 3], size[(k // 2 + 2) % 3]) for k in range(6)])
     height = bulge * extent * rng.uniform(0.5, 1.0, 6) * np.where(rng.random(6) < 0.75, 1.0, -1.0)
@@ -133,9 +133,9 @@ def drawn(
     *,
     are_edges_named: bool = True,
 ) -> list[dict[str, Any]]:
-    """Draw a box in the camera's frame into the images; returns its surfaces, which follow the `count` there are.
+    """Draw a box in the camera frame into the images; return its surfaces, numbered after the existing `count`.
 
-    Rounded edges get the nearest face's label; or, where `are_edges_named` is false, 0 beyond `EDGE_MM`.
+    Rounded edges get the nearest face's label or, if `are_edges_named` is false, 0 beyond `EDGE_MM`.
     """
     _, rays = gen.rays(model)
     reach = float(np.linalg.norm(box.half)) * 1.1
@@ -176,7 +176,7 @@ def plane(name: str, n: Any, c: Any, **clip: Any) -> dict[str, Any]:
 
 
 def _table(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[SoftBox], tuple[float, ...], float]:
-    """Floor, wall, table, and on it cartons, cans and balls: what a person puts before a depth sensor."""
+    """Draw floor, wall and table with cartons, cans and balls on it, a typical scene in front of a depth sensor."""
     plain = [
         plane("floor", UP, [0, 0, -TABLE_HEIGHT_MM]),
         plane("wall", [0, -1, 0], [0, rng.uniform(900, 1600), 0]),
@@ -208,7 +208,7 @@ def _table(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[S
 
 
 def _room(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[SoftBox], tuple[float, ...], float]:
-    """Floor, two walls, a sofa, a cabinet, a picture and a lamp."""
+    """Draw floor, two walls, a sofa, a cabinet, a picture and a lamp."""
     plain = [
         plane("floor", UP, [0, 0, 0]),
         plane("wall", [0, -1, 0], [0, 520, 0]),
@@ -227,9 +227,9 @@ def _room(gen: ModuleType, rng: np.random.Generator) -> tuple[list[Any], list[So
 
 
 def sofa(gen: ModuleType, rng: np.random.Generator, *, is_single: bool = False) -> tuple[list[SoftBox], float]:
-    """Base, arms, two or three seats and backs, up to two throw cushions; and how far it reaches to either side.
+    """Return base, arms, two or three seats and backs and up to two throw cushions, and the half width.
 
-    Its back stands at y = 500. An armchair (`is_single`) has one seat.
+    The back is at y = 500. An armchair (`is_single`) has one seat.
     """
     half_width, depth, seats = rng.uniform(650, 900), rng.uniform(800, 900), int(rng.integers(2, 4))
     if is_single:
@@ -240,7 +240,7 @@ def sofa(gen: ModuleType, rng: np.random.Generator, *, is_single: bool = False) 
     def upholstered(name: str, centre: Any, size: Any, turn: Array = STRAIGHT) -> SoftBox:
         return soft_box(rng, name, centre, size, turn, radius, bulge)
 
-    # Seats stand out over the base and arms beyond both: no camera tells faces apart that are flush.
+    # Seats protrude beyond the base and arms beyond both, because no camera can distinguish flush faces.
     front = 500.0 - depth
     soft = [upholstered("base", [0, front + depth / 2, base / 2], [2 * half_width, depth, base])]
     for side in (-1, 1):

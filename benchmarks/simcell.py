@@ -1,6 +1,6 @@
-"""The simulated bench with a controller over it and a panel pose that is wrong by a given amount.
+"""Simulated bench cell with a controller and a panel pose that is wrong by a given amount.
 
-The rig of the skills' tests and benchmark. It reads the simulator's truth, which no skill may.
+The tests and the benchmark of the skills use it. It reads the simulator's truth, which skills must not.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass
 class SimBench:
-    """A running simulated cell. `context` is what skills get; `truth` is for the judge."""
+    """Running simulated cell; skills receive `context`, and only the judge uses `truth`."""
 
     file: Cell
     clock: SimClock
@@ -44,20 +44,20 @@ class SimBench:
     devices: dict[str, Any]
 
     def truth(self, name: str) -> ObjectTruth:
-        """What an object really shows now."""
+        """Return the true state of an object."""
         found: ObjectTruth = next(o for o in self.arm.truth().objects if o.name == name)
         return found
 
     def true_panel(self) -> RigidTransform:
-        """Where the panel really is."""
+        """Return the true pose of the panel, base_from_panel."""
         return RigidTransform.from_matrix(self.arm.truth().base_from_panel_matrix)
 
     def peak_force_n(self) -> float:
-        """Largest contact force that the engine saw on the arm."""
+        """Return the largest contact force of the physics engine on the arm."""
         return float(self.arm.truth().peak_force_n)
 
     def look(self, name: str, *, angle_sigma_rad: float = 0.0, value_sigma: float = 0.0) -> ObjectState:
-        """A second look: the truth with noise as a camera's reading has it."""
+        """Return a simulated reading after a motion: the truth with the noise of a camera's reading."""
         truth = self.truth(name)
         if truth.value is None:
             return ObjectState(name=name, state=truth.state)
@@ -71,11 +71,11 @@ class SimBench:
     def operate(
         self, name: str, goal: str | float, *, current: ObjectState | None = None, verify: Verify | None = None
     ) -> SkillReport:
-        """Work a control of the panel by the skill of its kind."""
+        """Operate a control of the panel by the skill of its kind."""
         return operate(self.context, self.context.panel.object(name), goal, current=current, verify=verify)
 
     def close(self) -> None:
-        """End controller and world."""
+        """End the controller and the world."""
         self.controller.close()
         self.shared.close()
 
@@ -92,9 +92,7 @@ def open_bench(
     speed: float = 0.25,
     progress: Callable[[float, str], None] = _silent,
 ) -> SimBench:
-    """The bench of a seed, believed to stand `error_m` and `error_rad` away from where it does, in a random
-    direction.
-    """
+    """Open the bench of a seed with a panel pose that is wrong by `error_m` and `error_rad` in a random direction."""
     file = load_cell(ROOT / "cells" / "bench.toml", seed=seed)
     clock, shared = SimClock(), Shared()
     made: dict[str, Any] = {}
@@ -127,7 +125,7 @@ def open_bench(
 
 
 def _believed(true: RigidTransform, error_m: float, error_rad: float, rng: np.random.Generator) -> UncertainPose:
-    """The pose off by an error of that size, in a random direction."""
+    """Return the pose with an error of that size in a random direction."""
     directions = rng.standard_normal((2, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     error = np.concatenate([error_m * directions[0], error_rad * directions[1]])

@@ -1,7 +1,7 @@
-"""How fast and how exact the simulated cell is: `python -m benchmarks.simulation [CELL]`.
+"""Measures speed and accuracy of the simulated cell: `python -m benchmarks.simulation [CELL]`.
 
-Prints one line a goal with the pass line beside the measured value (medians). Wall times need an idle machine; the CPU
-times beside them say what the same work costs when others compete for the cores.
+Prints one line per goal with the pass line beside the measured median. Wall-clock times need an idle machine; the CPU
+times beside them are valid on a busy machine, too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PICTURES = 15
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Bench:
-    """A running cell with all its devices."""
+    """Running cell with all its devices."""
 
     clock: SimClock
     shared: Shared
@@ -36,12 +36,12 @@ class Bench:
     rate_hz: float
 
     def deadline(self) -> Deadline:
-        """One second from now."""
+        """Return a deadline one second from now."""
         return Deadline.after(self.clock, 1.0)
 
 
 def start(path: Path, **options: dict[str, Any]) -> Bench:
-    """Connect every device of a cell file; `options` replace those of a device by name."""
+    """Connect every device of a cell file; `options` replace the options of devices by name."""
     cell = load_cell(path)
     clock, shared = SimClock(), Shared()
     devices = {
@@ -56,7 +56,7 @@ def start(path: Path, **options: dict[str, Any]) -> Bench:
 
 
 def real_time_factor(bench: Bench) -> tuple[float, float, float]:
-    """Simulated over wall seconds, all cheap sensors read each tick; CPU microseconds a tick of cell and world."""
+    """Return simulated per wall-clock time with fast sensors read each tick, and CPU us per tick of cell and world."""
     arm = bench.devices["arm"]
     arm.enable(deadline=bench.deadline())
     start_rad = arm.read_state(deadline=bench.deadline()).value.position_rad
@@ -87,7 +87,7 @@ def _tick(bench: Bench, setpoint_rad: np.ndarray) -> None:
 
 
 def picture_ms(bench: Bench, read: Callable[[Deadline], Any]) -> float:
-    """Median wall milliseconds of one picture."""
+    """Return the median wall-clock time of one image in milliseconds."""
     times = []
     for _ in range(PICTURES):
         bench.clock.sleep(1.0 / bench.rate_hz)
@@ -98,7 +98,7 @@ def picture_ms(bench: Bench, read: Callable[[Deadline], Any]) -> float:
 
 
 def sag_rad(bench: Bench) -> float:
-    """How far the arm sinks in two seconds of holding."""
+    """Return how far the arm sags in two seconds of holding still."""
     arm = bench.devices["arm"]
     arm.enable(deadline=bench.deadline())
     start_rad = arm.read_state(deadline=bench.deadline()).value.position_rad
@@ -107,7 +107,7 @@ def sag_rad(bench: Bench) -> float:
 
 
 def line(name: str, limit: str, value: str, passed: bool | None) -> None:
-    """One row of the table; None where the row only informs."""
+    """Print one row of the table; `passed` is None if the row has no pass line."""
     verdict = {True: "pass", False: "FAIL", None: ""}[passed]
     print(f"{name:<46} {limit:>14} {value:>14}  {verdict}")
 

@@ -1,8 +1,9 @@
-"""Connected components in horizontal tiles, as the paper labels them on a cube (Section III, Fig. 9).
+"""Labels connected components in horizontal tiles, as the paper does on a hypercube (Section III, Fig. 9).
 
-The paper's five steps: tiles, a raster scan in each, exchange of border rows by cube doubling, merging, relabelling. Here
-the exchange is a union-find over the seam rows, neighbours first, then pairs of pairs: log2(tiles) rounds. Labels follow
-the raster order of each component's first pixel, so they are the same for any number of tiles.
+The paper's five steps are: division into tiles, a raster scan of each, exchange of border rows by cube doubling,
+merging, relabelling. Here the exchange is a union-find over the seam rows, first of neighbours, then of pairs of pairs,
+in log2(tiles) rounds. Labels follow the raster order of each component's first pixel, so they do not depend on the
+number of tiles.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from perception.range.tiles import for_each_tile, tile_rows
 def label_components(
     mask: Mask, link_right: Mask, link_down: Mask, *, tiles: int = 1, pool: ThreadPoolExecutor | None = None
 ) -> tuple[Labels, Labels]:
-    """Components of linked pixels.
+    """Return the components of linked pixels.
 
     Args:
-        mask: (H, W) pixels that take part.
-        link_right: (H, W) whether pixel (v, u) belongs with (v, u + 1); the last column is not read.
-        link_down: (H, W) whether (v, u) belongs with (v + 1, u); the last row is not read.
+        mask: (H, W) pixels to be labelled.
+        link_right: (H, W) whether pixel (v, u) is connected to (v, u + 1); the last column is not read.
+        link_down: (H, W) whether (v, u) is connected to (v + 1, u); the last row is not read.
 
     Returns:
         labels (H, W) int32, 0 outside the mask, from 1 in raster order of first pixels; sizes (n + 1,), entry 0 unused.
@@ -42,9 +43,9 @@ def label_components(
 
 
 def merge_rounds(seams: list[int]) -> list[list[int]]:
-    """Seams in the order of cube doubling: the first round holds every second one, the last round a single one.
+    """Return the seams in the order of cube doubling: every second one in the first round, a single one in the last.
 
-    Seams of one round join disjoint groups of tiles, so a round's merges may run at the same time.
+    The seams of one round join disjoint groups of tiles, so the merges of a round can run in parallel.
     """
     rounds = []
     while seams:
@@ -91,6 +92,6 @@ def _relabel(mask: Mask, parent: Indices) -> tuple[Labels, Labels]:
                 found += 1
                 flat[i] = found
             else:
-                flat[i] = flat[parent[i]]  # parents come first in raster order, so theirs is already known
+                flat[i] = flat[parent[i]]  # a parent comes first in raster order, so its label is already known
             sizes[flat[i]] += 1
     return label, sizes[: found + 1].copy()

@@ -1,4 +1,4 @@
-"""Vision: the panel's lights and pose, its objects, and their states, from images (paper II).
+"""Vision: pose of the panel from its lights, and objects of the panel with their states, from images (paper II).
 
 The module `viewpoints` proposes camera poses, and `teaching` adds kinds and panels.
 """

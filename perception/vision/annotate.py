@@ -1,4 +1,4 @@
-"""Readings drawn into the image for people."""
+"""Drawing of readings into an image for people."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from perception.vision.labels import PixelBox, place_labels
 from perception.vision.reading import ObjectReading
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-RIM = 3  # a dark one keeps a bright text readable on a bright panel
+RIM = 3  # width of text with its dark rim, which keeps bright text readable on a bright panel
 GREEN, AMBER, RED = (40, 220, 60), (255, 190, 0), (255, 60, 60)
 Colour = tuple[int, int, int]
 
 
 def draw_annotated(image: NDArray[Any], readings: Iterable[ObjectReading]) -> Image:
-    """RGB uint8 (H, W, 3): outlines and readings; green read, amber refused, red not there.
+    """Return an RGB uint8 image (H, W, 3) with outlines and readings: green is read, amber refused, red not present.
 
     Args:
         image: gray or RGB uint8; not changed.
@@ -35,7 +35,10 @@ def draw_annotated(image: NDArray[Any], readings: Iterable[ObjectReading]) -> Im
 def draw_outlines(
     image: NDArray[Any], outlines_px: Sequence[NDArray[Any]], texts: Sequence[str], is_sure: Sequence[bool]
 ) -> Image:
-    """RGB uint8 (H, W, 3): closed outlines, (N, 2) px each, green where sure and else amber, with a text beside each."""
+    """Return an RGB uint8 image (H, W, 3) with closed outlines, (N, 2) px each, and a text beside each of them.
+
+    Outlines are green where `is_sure`, else amber.
+    """
     return _draw(image, outlines_px, texts, [GREEN if sure else AMBER for sure in is_sure])
 
 
@@ -61,7 +64,7 @@ def _draw(
 
 
 def said(reading: ObjectReading) -> str:
-    """Short text of an object's reading."""
+    """Return a short text of an object's reading."""
     if not reading.present:
         return "not seen"
     if reading.reason is not None:
@@ -74,12 +77,13 @@ def said(reading: ObjectReading) -> str:
 
 
 def _size(text: str, scale: float) -> tuple[int, int]:
-    """Width and height of the text with its rim and what hangs below the line, pixels."""
+    """Return width and height of the text in pixels, with its rim and the parts below the line."""
     (width, height), below = cv2.getTextSize(text, FONT, scale, RIM)
     return width + RIM, height + below
 
 
 def _write(picture: Image, text: str, place: PixelBox, colour: Colour, scale: float) -> None:
+    """Write a text into its box, with a dark rim."""
     _, below = cv2.getTextSize(text, FONT, scale, RIM)
     foot = (place.x + RIM // 2, place.y + place.height - below)
     cv2.putText(picture, text, foot, FONT, scale, (0, 0, 0), RIM, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""Compiled bilinear samples: one pass where numpy and OpenCV would make coordinates, copies and shapes first."""
+"""Compiled bilinear sampling: one pass, without the intermediate arrays that numpy and OpenCV would need."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hal.jit import compiled, inlined
 
 @inlined
 def value_at(image: NDArray[Any], u: float, v: float) -> float:
-    """Bilinear value of an (H, W) picture; the border repeats."""
+    """Return the bilinear value of an (H, W) image at (u, v); beyond the border the image repeats its edge."""
     height, width = image.shape
     u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)
     x, y = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
@@ -27,7 +27,10 @@ def value_at(image: NDArray[Any], u: float, v: float) -> float:
 def polar_values(
     image: Image, centre_px: tuple[float, float], radii_px: Array, directions: Array
 ) -> NDArray[np.float32]:
-    """(radii, directions) values about a centre; `directions` is (2, N), the change of u and of v per pixel of radius."""
+    """Return values (radii, directions) about a centre.
+
+    `directions` is (2, N): the change of u and of v per pixel of radius.
+    """
     out = np.empty((len(radii_px), directions.shape[1]), np.float32)
     for i in range(len(radii_px)):
         for j in range(directions.shape[1]):
@@ -39,7 +42,7 @@ def polar_values(
 
 @compiled
 def step_counts(gray: Image, every: int) -> NDArray[np.int64]:
-    """(1021,) histogram of the second difference's magnitude along every `every`-th row."""
+    """Return the histogram (1021,) of the absolute second difference along every `every`-th row."""
     counts = np.zeros(4 * 255 + 1, np.int64)
     for v in range(0, gray.shape[0], every):
         for u in range(1, gray.shape[1] - 1):

@@ -1,4 +1,4 @@
-"""Images as callers hand them in, checked once: typed refusals here keep every later step free of special cases."""
+"""Decoding and checking of images that callers supply; later steps need no further checks."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from hal.arrays import Image
 from hal.errors import InvalidRequest, NotObservable
 
-MIN_SIDE_PX = 24  # no object has readable detail below this
-MAX_PIXELS = 40_000_000  # beyond it a decoder could be used to exhaust the memory
-FORMATS = ("PNG", "JPEG", "BMP")  # a decoder fewer is an attack fewer
-BLACK_LEVEL = 6
-WHITE_LEVEL = 250
+MIN_SIDE_PX = 24  # in smaller images no object has readable detail
+MAX_PIXELS = 40_000_000  # larger images could be used to exhaust the memory
+FORMATS = ("PNG", "JPEG", "BMP")  # few, because every decoder can be attacked
+BLACK_LEVEL = 6  # gray level up to which a pixel is black
+WHITE_LEVEL = 250  # gray level from which a pixel counts as saturated
 
 
 def decode(data: bytes) -> Image:
-    """An RGB (H, W, 3) or gray (H, W) uint8 image from PNG, JPEG or BMP bytes.
+    """Decode PNG, JPEG or BMP bytes to an RGB (H, W, 3) or gray (H, W) uint8 image.
 
     Raises:
-        InvalidRequest: not an image, truncated, too large, or deeper than 8 bits a channel.
+        InvalidRequest: not an image, truncated, too large, or with more than 8 bits per channel.
     """
     from PIL import Image as Pillow
     from PIL import ImageOps, UnidentifiedImageError
@@ -36,7 +36,7 @@ def decode(data: bytes) -> Image:
                 "the image has more than 8 bits a channel",
                 hint="convert it to 8 bit, with the exposure that you want",
             )
-        upright = ImageOps.exif_transpose(picture)  # as every browser shows it: clicks are made on that
+        upright = ImageOps.exif_transpose(picture)  # as browsers show it, because users click on what they see
         return np.asarray(upright.convert("L" if upright.mode in ("1", "L", "LA") else "RGB"), np.uint8)
     except UnidentifiedImageError:
         raise InvalidRequest("the bytes are not an image that can be read", hint="send PNG, JPEG or BMP") from None
@@ -45,16 +45,19 @@ def decode(data: bytes) -> Image:
 
 
 def _is_deep_png(data: bytes) -> bool:
-    """A colour PNG with 16 bits a channel, of which Pillow would drop the lower 8 without a word: byte 24 of IHDR."""
+    """Return whether the bytes are a PNG with 16 bits per channel (byte 24 of IHDR).
+
+    Pillow would silently drop the lower 8 bits of a colour PNG.
+    """
     return data.startswith(b"\x89PNG") and len(data) > 24 and data[24] == 16
 
 
 def as_gray(image: NDArray[Any]) -> Image:
-    """The gray (H, W) uint8 image of a gray or RGB one, checked for size, depth and light.
+    """Return the gray (H, W) uint8 image of a gray or RGB one, after checking size, depth and brightness.
 
     Raises:
         InvalidRequest: wrong type, shape or size.
-        NotObservable: all black, all saturated, or without any structure.
+        NotObservable: all black or all saturated.
     """
     import cv2
 
@@ -71,14 +74,14 @@ def as_gray(image: NDArray[Any]) -> Image:
         raise NotObservable("the image is black", hint="more light or a longer exposure; check the lens cap")
     if np.percentile(sample, 2.0) >= WHITE_LEVEL:
         raise NotObservable("the image is saturated", hint="less light or a shorter exposure")
-    return np.require(gray, requirements=("C", "W"))  # compiled loops take no other layout
+    return np.require(gray, requirements=("C", "W"))  # the layout that compiled loops require
 
 
 def check_image(image: NDArray[Any]) -> None:
-    """Refuse what is not an 8-bit gray or RGB image of a sensible size.
+    """Check that an image is 8-bit gray or RGB and of a sensible size.
 
     Raises:
-        InvalidRequest: says what is wrong.
+        InvalidRequest: it is not; the message says why.
     """
     if (
         not isinstance(image, np.ndarray)
@@ -101,4 +104,5 @@ def check_image(image: NDArray[Any]) -> None:
 
 
 def _too_large(width: int, height: int) -> InvalidRequest:
+    """Return the error for an image with too many pixels."""
     return InvalidRequest(f"image of {width}x{height} px is too large", hint=f"at most {MAX_PIXELS} pixels")

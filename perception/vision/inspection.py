@@ -25,13 +25,13 @@ from perception.vision.registration.outline import contour_m
 from perception.vision.registration.register import Registration, register
 from perception.vision.status.reader import patch_of, read_patch, reader_of
 
-MIN_SUPPORT = 0.25  # share of the model's edges that must be found for the panel to be this one
+MIN_SUPPORT = 0.25  # least share of the model's edges that must be found; with less it is another panel or pose
 MIN_EDGE_SHARE = 0.2  # the same for one object
-TELLS = 0.9  # from this confidence on a reading proves the object although its outline has the plate's gray
+TELLS = 0.9  # confidence from which a reading proves the object although its outline has the plate's gray
 NO_OUTLINE = "the object's outline is not where it should be: check the panel file, or something covers it"
 MIN_RESOLUTION_PX = 10.0  # smaller objects cannot be read
-JUMP = 0.25  # of the scale: a larger change since the last reading needs a confident reading
-JUMP_CONFIDENCE = 0.9
+JUMP = 0.25  # largest change since the last reading, relative to the scale, that does not need a confident reading
+JUMP_CONFIDENCE = 0.9  # of a reading after a larger change
 
 
 def inspect(
@@ -44,20 +44,20 @@ def inspect(
     previous: Mapping[str, ObjectReading] | None = None,
     least_confidence: float = ANSWER_AT,
 ) -> tuple[ObjectReading, ...]:
-    """Every object of a taught panel as one image shows it.
+    """Read every object of a taught panel in one image.
 
     Args:
-        image: (H, W) gray or (H, W, 3) RGB uint8, as the camera gave it.
+        image: (H, W) gray or (H, W, 3) RGB uint8, as the camera recorded it.
         intrinsics: of this camera at this resolution.
         camera_from_panel: pose, good to a few pixels, with its covariance.
         panel: the panel file.
-        names: objects wanted; all by default.
-        previous: last readings by name: an implausible jump is answered only when the evidence is strong.
-        least_confidence: 0 to 1; less sure readings are refused. Below `ANSWER_AT`, the default, best guesses are answers.
+        names: names of the objects to read; all by default.
+        previous: last readings by name; an implausible change is answered only if the evidence is strong.
+        least_confidence: 0 to 1; less certain readings are refused. Below the default `ANSWER_AT`, guesses are answers.
 
     Raises:
         InvalidRequest: bad image, calibration of another size, unknown name.
-        NotObservable: the image shows nothing.
+        NotObservable: the image is black or saturated.
         NotFound: the image does not show this panel at this pose.
     """
     gray = as_gray(image)
@@ -77,13 +77,13 @@ def inspect_view(
     digits_taught: bool = True,
     least_confidence: float = ANSWER_AT,
 ) -> tuple[ObjectReading, ...]:
-    """`inspect` for any view of the panel (see perception.vision.projection).
+    """Do `inspect` for any view of the panel (see perception.vision.projection).
 
-    `digits_taught` False: the panel file does not know how many digits and decimals its displays have.
+    `digits_taught`: whether the panel file states the number of digits and decimals of its displays.
     """
     wanted = panel.objects if names is None else tuple(panel.object(name) for name in names)
     registration = register(gray, view, panel)
-    if registration.support < MIN_SUPPORT:  # NaN: too few edges in view to doubt the pose
+    if registration.support < MIN_SUPPORT:  # false for NaN, if too few edges are in view to judge the pose
         raise NotFound(
             f"the image does not show panel {panel.name!r} at this pose: {registration.support:.0%} of its edges found",
             hint="find the panel's pose again; check camera calibration, panel file and that the panel is upright",
@@ -116,6 +116,7 @@ def _inspect_one(
     before: ObjectReading | None,
     digits_taught: bool,
 ) -> ObjectReading:
+    """Check that one object is present, and read it."""
     view = registration.view
     shift = registration.shift_px.get(spec.name, np.zeros(2))
     centre_px = view.project([spec.point_m])[0] + shift
@@ -149,13 +150,13 @@ def _inspect_one(
 
 
 def _is_bare(patch: Patch, noise: float) -> bool:
-    """Whether the patch shows nothing that stands out from the noise."""
+    """Return whether nothing in the patch stands out from the noise."""
     smooth = cv2.GaussianBlur(patch.gray, (0, 0), 1.5)
     return float(np.percentile(smooth, 97)) - float(np.percentile(smooth, 3)) < 1.5 * noise + 6.0
 
 
 def plausible(status: PatchReading, spec: PanelObject, before: ObjectReading | None) -> PatchReading:
-    """The status, or a refusal when it jumps from the previous value without strong evidence."""
+    """Return the status, or a refusal if it differs much from the previous value without strong evidence."""
     if before is None or before.value is None or status.value is None or status.confidence >= JUMP_CONFIDENCE:
         return status
     if spec.full_scale is None:
@@ -169,7 +170,10 @@ def plausible(status: PatchReading, spec: PanelObject, before: ObjectReading | N
 
 
 def _with_place(reading: ObjectReading, registration: Registration, spec: PanelObject) -> ObjectReading:
-    """Adds the centre in panel metres: the pixel's ray cut with the plate, and the pixel's uncertainty there."""
+    """Return the reading with its centre in the panel frame, and the centre's covariance.
+
+    The centre is the intersection of the pixel's ray with the plate.
+    """
     view = registration.view
     if not isinstance(view, CameraProjection) or not np.isfinite(reading.centre_px).all():
         return reading
@@ -191,7 +195,7 @@ def _with_place(reading: ObjectReading, registration: Registration, spec: PanelO
 
 
 def _plate_jacobian(view: PanelProjection, point_m: tuple[float, float, float]) -> Array:
-    """(2, 2) metres on the plate per pixel at a panel point."""
+    """Return the Jacobian (2, 2) of the position on the plate, in metres per pixel, at a panel point."""
     step = 1e-3
     base = np.array(point_m)
     px = view.project(base + step * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))

@@ -1,11 +1,11 @@
 """Taught knowledge about kinds of objects (files: `knowledge_files`).
 
 A kind has a size and looks. A look is the feature vector of one taught example (see `look`): four rows of numbers
-over the distance from the middle, and two tables with such a row per direction. The kind `nothing` holds looks of what
+over the distance from the middle, and two tables with one row per direction. The kind `nothing` has looks of what
 is *not* an object: screws, labels, parts of objects. Adding a look to one kind changes no other kind's looks.
 
-Some looks were taught from noisy images, such as a camera takes in bad light, and only noisy images are compared with
-them; in a good image, other objects would resemble these blurred, half shaded examples.
+Some looks were taught from noisy images, as a camera takes them in bad light. Only noisy images are compared with them,
+because in a good image other objects would resemble these blurred, half shaded examples.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ class TaughtKind:
     """A kind of object.
 
     Attributes:
-        name: as in the panel file where readers exist, else free.
-        size_m: (width, height) of a typical one, m.
-        looks: (N, LENGTH), one row an example.
-        middles_m: (N, 2) from the place that looks so to the object's middle, x right, y up; None: that is the middle.
-        noisy: (N,) which looks count in noisy images only; None: none of them.
+        name: as in the panel file if it has a reader, else free.
+        size_m: (width, height) of a typical object, m.
+        looks: (N, LENGTH), one row per example.
+        taught_by: a remark about the origin of the examples.
+        middles_m: (N, 2) offset from the place with that look to the object's middle, x right, y up; None if all are
+        zero.
+        noisy: (N,) which looks count in noisy images only; None if none do.
     """
 
     name: str
@@ -45,17 +47,17 @@ class TaughtKind:
 
     @property
     def lasting(self) -> TaughtKind:
-        """The kind with the looks only that count in every image."""
+        """The kind with only those looks that count in every image."""
         return self if self.noisy is None else replace(self.of(~self.noisy), noisy=None)
 
     def of(self, rows: NDArray[Any]) -> TaughtKind:
-        """The kind with some of its looks only."""
+        """Return the kind with only the given rows of its looks."""
         middles_m = None if self.middles_m is None else self.middles_m[rows]
         noisy = None if self.noisy is None else self.noisy[rows]
         return replace(self, looks=self.looks[rows], middles_m=middles_m, noisy=noisy)
 
     def joined(self, other: TaughtKind) -> TaughtKind:
-        """The kind with another one's looks after its own."""
+        """Return the kind with another one's looks appended to its own."""
         middles_m = None
         if self.middles_m is not None or other.middles_m is not None:
             middles_m = np.vstack(
@@ -71,10 +73,10 @@ class TaughtKind:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Knowledge:
-    """All kinds, and what likeness to them means.
+    """All kinds, and the measure of similarity to them.
 
     Attributes:
-        spread: (LENGTH,) how much every number varies between things at all, the unit of likeness.
+        spread: (LENGTH,) how much every number varies between all examples, the unit of similarity.
         weights: (LENGTH,) of the numbers.
     """
 
@@ -83,28 +85,33 @@ class Knowledge:
     weights: Array = field(default_factory=lambda: WEIGHTS)
 
     def for_image(self, *, noisy: bool) -> Knowledge:
-        """What an image is compared with: if it is noisy, all looks without what lies far from their middles; else only
-        the looks that count in every image.
+        """Return the knowledge with which an image is compared.
+
+        For a noisy image these are all looks, without numbers far from the middle; else only the looks that count in
+        every image.
         """
         return _for_image(self, noisy=noisy)
 
     def kind(self, name: str) -> TaughtKind | None:
-        """The kind of that name, or None."""
+        """Return the kind with that name, or None."""
         return next((kind for kind in self.kinds if kind.name == name), None)
 
     def with_look(self, name: str, size_m: tuple[float, float], look: Array, *, taught_by: str = "") -> Knowledge:
-        """The knowledge with one more look; a new name makes a new kind."""
+        """Return the knowledge with one more look; a new name adds a kind."""
         return self.grown(TaughtKind(name=name, size_m=size_m, looks=look[None], taught_by=taught_by))
 
     def grown(self, more: TaughtKind) -> Knowledge:
-        """The knowledge with further looks of a kind, which may be new."""
+        """Return the knowledge with further looks of a kind, which may be new."""
         known = self.kind(more.name)
         if known is None:
             return replace(self, kinds=(*self.kinds, more))
         return replace(self, kinds=tuple(kind.joined(more) if kind is known else kind for kind in self.kinds))
 
     def with_looks_of(self, kinds: Iterable[TaughtKind]) -> Knowledge:
-        """The knowledge with these kinds' looks beside its own; a new name makes a new kind, a known look adds nothing."""
+        """Return the knowledge with the looks of these kinds added.
+
+        Looks that are already known are not added again.
+        """
         grown = self
         for kind in kinds:
             known = grown.kind(kind.name)
@@ -115,7 +122,7 @@ class Knowledge:
 
 @lru_cache(maxsize=8)
 def _for_image(knowledge: Knowledge, *, noisy: bool) -> Knowledge:
-    """See `Knowledge.for_image`: the same object every time, as `prepared` wants it."""
+    """Compute `Knowledge.for_image`; equal arguments give the same object, so that `prepared` can cache by identity."""
     if noisy:
         return replace(knowledge, weights=NOISY_WEIGHTS)
     kinds = (kind.lasting for kind in knowledge.kinds)

@@ -1,7 +1,7 @@
-"""Files of kinds: TOML where a person taught or wrote it, a numpy archive (`.npz`) where a benchmark generated it.
+"""Files of kinds: TOML if a person taught or wrote it, a numpy archive (`.npz`) if a benchmark generated it.
 
-Both hold the same: name, size, and looks in hundredths. An archive is read some hundred times faster, and nobody reads
-thousands of generated rows. A folder holds each kind once.
+Both contain name, size, and looks in hundredths. An archive loads some hundred times faster, and nobody reads thousands
+of generated rows. A folder contains each kind once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from perception.vision.knowledge import Knowledge, TaughtKind, spread_of
 from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 
 SHIPPED = Path(__file__).parent / "knowledge"
-OTHER_FILES = frozenset({"proportions"})  # of a knowledge folder: no kinds
+OTHER_FILES = frozenset({"proportions"})  # of a knowledge folder, which are not kinds
 UNIT = 100.0  # looks are stored in hundredths
 REPAIR = "restore it, or delete it and teach the kind again"
 
@@ -33,13 +33,13 @@ Around = Annotated[tuple[RingRow, ...], Field(min_length=DIRECTIONS, max_length=
 
 
 class LookRecord(Strict):
-    """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, hundredths.
+    """One example: relative gray, unevenness, edges and strong edges over the distance from the middle, in hundredths.
 
-    `middle_m`: from the place that looks so to the object's middle, x right and y up, where a part of the object or its
-    label shows better than its middle.
+    `middle_m`: offset from the place with this look to the object's middle, x right and y up. It is not zero if a part
+    of the object or its label is more distinct than its middle.
 
-    `gray_around` and `edge_around` have a row a direction, clockwise from straight up; left out, every direction is as
-    `gray` and `edge` are all around. `noisy`: counts in noisy images only.
+    `gray_around` and `edge_around` have one row per direction, clockwise from straight up; if they are absent, all
+    directions have the values of `gray` and `edge`. `noisy`: the look counts in noisy images only.
     """
 
     gray: Row
@@ -53,7 +53,7 @@ class LookRecord(Strict):
 
     @property
     def look(self) -> Array:
-        """(LENGTH,) in the order of `look`."""
+        """The numbers (LENGTH,) in the order of the module `look`."""
         around = [
             np.asarray(given, float).ravel() if given is not None else np.tile(_ring_means(row), DIRECTIONS)
             for given, row in ((self.gray_around, self.gray), (self.edge_around, self.edge))
@@ -63,7 +63,7 @@ class LookRecord(Strict):
 
 
 class KindRecord(Strict):
-    """A kind's file."""
+    """Content of a kind's file."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
     width_m: Annotated[float, Field(gt=0, le=1.0)]
@@ -79,10 +79,10 @@ class KindRecord(Strict):
 
 
 def load_knowledge(folder: Path | None = None) -> Knowledge:
-    """All kinds of a folder, by name; the shipped ones if none is given.
+    """Load all kinds of a folder, by name; those that come with the package if none is given.
 
     Raises:
-        ConfigError: a file is malformed, a kind has two files, or the folder holds no kind.
+        ConfigError: a file is malformed, a kind has two files, or the folder contains no kind.
     """
     files = kind_files(folder)
     if not files:
@@ -92,7 +92,7 @@ def load_knowledge(folder: Path | None = None) -> Knowledge:
 
 
 def kind_files(folder: Path | None = None) -> list[Path]:
-    """The files of a folder's kinds, by name; the shipped ones if none is given.
+    """Return the files of a folder's kinds, by name; those that come with the package if none is given.
 
     Raises:
         ConfigError: a kind has two files.
@@ -112,16 +112,19 @@ def kind_files(folder: Path | None = None) -> list[Path]:
 
 
 def load_kind(path: Path) -> TaughtKind:
-    """The kind of one file.
+    """Load the kind of one file.
 
     Raises:
-        ConfigError: the file is malformed or damaged; names it and what helps.
+        ConfigError: the file is malformed or damaged; the message names it and the hint says what helps.
     """
     return _archived(path) if path.suffix == ".npz" else _kind(load_toml(path, KindRecord, "knowledge file"))
 
 
 def write_kind(kind: TaughtKind, folder: Path) -> Path:
-    """Write one kind's TOML and return its path; where only looks are new, they are added at the end of the file that is there."""
+    """Write one kind as TOML and return the path.
+
+    If only looks are new, they are appended to the existing file.
+    """
     path = folder / f"{kind.name}.toml"
     known = load_kind(path) if path.exists() else None
     if known is not None and _is_continued(known, kind):
@@ -131,7 +134,7 @@ def write_kind(kind: TaughtKind, folder: Path) -> Path:
 
 
 def kind_text(kind: TaughtKind) -> str:
-    """The TOML of one kind."""
+    """Return the TOML text of one kind."""
     remark = (
         f"What a {kind.name.replace('_', ' ')} looks like: rows over the distance from its middle, "
         f"{RADII_M[0] * 1e3:g} to {RADII_M[-1] * 1e3:g} mm, in hundredths."
@@ -158,6 +161,11 @@ def write_generated_kind(kind: TaughtKind, folder: Path) -> Path:
 
 
 def _archived(path: Path) -> TaughtKind:
+    """Load the kind of a numpy archive.
+
+    Raises:
+        ConfigError: the file is malformed or damaged.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             name, taught_by, size_m = str(file["name"]), str(file["taught_by"]), file["size_m"]
@@ -184,13 +192,13 @@ def _archived(path: Path) -> TaughtKind:
 
 
 def _is_continued(known: TaughtKind, kind: TaughtKind) -> bool:
-    """Whether a kind is the known one with further looks."""
+    """Return whether a kind is the known one with further looks."""
     first = kind.of(np.arange(min(len(known.looks), len(kind.looks))))
     return (known.name, known.taught_by) == (kind.name, kind.taught_by) and _looks_text(first) == _looks_text(known)
 
 
 def _looks_text(kind: TaughtKind) -> str:
-    """One table per look; whole numbers only, which need no escaping."""
+    """Return the TOML text of the looks, one table per look; it has only whole numbers, which need no escaping."""
     lines = []
     for k, look in enumerate(kind.looks):
         lines.append("\n[[looks]]")
@@ -207,6 +215,7 @@ def _looks_text(kind: TaughtKind) -> str:
 
 
 def _kind(record: KindRecord) -> TaughtKind:
+    """Build the kind of a TOML record."""
     middles_m = np.array([look.middle_m for look in record.looks])
     noisy = np.array([look.noisy for look in record.looks])
     return TaughtKind(
@@ -220,9 +229,10 @@ def _kind(record: KindRecord) -> TaughtKind:
 
 
 def _ring_means(row: tuple[int, ...]) -> Array:
-    """(RINGS,) of a row over all radii."""
+    """Return the means (RINGS,) of a row over all radii, two radii per ring."""
     return np.asarray(np.array(row[: 2 * RINGS], float).reshape(RINGS, 2).mean(axis=1))
 
 
 def _written(row: Array) -> str:
+    """Return a row in hundredths as a TOML array."""
     return f"[{', '.join(str(round(float(v) * UNIT)) for v in row)}]"

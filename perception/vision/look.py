@@ -1,23 +1,24 @@
-"""The numbers of a look: which there are, in which order, and what each counts.
+"""Definition of the feature vector of a place on the plate, called a look: its numbers, their order and their weights.
 
-A look is what a place on the plate looks like (measured in `finding.features`): `GROUPS`, one number per radius, then
-`AROUND_GROUPS`, one number per direction and ring.
+A look (measured in `finding.features`) has one number per radius for each of `GROUPS`, then one number per direction
+and ring for each of `AROUND_GROUPS`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-RADII_M = np.arange(0.0015, 0.045, 0.003)  # of the circles about the middle of the place
+RADII_M = np.arange(0.0015, 0.045, 0.003)  # of circles about the middle of the place
 GROUPS = ("gray", "uneven", "edge", "strong_edge")
 AROUND_GROUPS = ("gray_around", "edge_around")
 DIRECTIONS = 8  # clockwise from straight up
-RINGS = len(RADII_M) // 2  # two radii each; the outermost is left to neighbours
+RINGS = len(RADII_M) // 2  # two radii each; beyond the outermost are neighbouring objects
 LENGTH = len(GROUPS) * len(RADII_M) + len(AROUND_GROUPS) * DIRECTIONS * RINGS
-# What is the same whichever way a thing is turned counts twice per number, so as much as what lies in which direction.
+# Numbers that do not depend on the orientation count twice, so that both groups have about the same total weight.
 WEIGHTS = np.repeat([2.0, 1.0], [len(GROUPS) * len(RADII_M), len(AROUND_GROUPS) * DIRECTIONS * RINGS])
-# Of a noisy image edges count more than gray, which its light changes (1.5 to 3 times as much does nearly as well on overviews
-# that were not taught on), and what lies further out nothing: glare, shadow and cables make as much of it as the neighbours.
+# In a noisy image edges count more than gray, which the light changes; factors of 1.5 to 3 gave about the same results
+# on overviews that were not used for teaching. Numbers beyond NOISY_REACH_M do not count, because glare, shadow and
+# cables affect them as much as neighbouring objects do.
 NOISY_REACH_M = 0.036
 NOISY_WEIGHTS = (
     np.repeat(

@@ -1,4 +1,4 @@
-"""Merging of several views of one object: what occludes it from one side rarely does from another."""
+"""Merging of several views of one object, because an occluder in one view rarely hides the same part in another."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Sequence
 
 from perception.vision.reading import ANSWER_AT, ObjectReading, PatchReading
 
-UNLISTED = 0.01  # probability of a number that a look does not list: it may have been wrong
-MOST_CONFIDENT = 0.9  # of a number that no look alone could tell
-SIGMAS = 5.0  # two values may lie so far apart
+UNLISTED = 0.01  # probability of a number that a view does not list, because the view may be wrong
+MOST_CONFIDENT = 0.9  # highest confidence in a number that no single view could determine
+SIGMAS = 5.0  # largest difference of two consistent values, in standard deviations
 
 
 def merge_views(looks: Sequence[ObjectReading]) -> ObjectReading:
     """Merge the readings of several views into one.
 
-    The most confident answer holds unless another view contradicts it. Without an answer, the numbers that each view of
-    a display leaves possible are weighed together; a number that one view excludes is dropped.
+    The most confident answer is returned unless another view contradicts it. If no view gives an answer, the numbers of
+    a display that the views leave possible are weighted together; a number that one view excludes is unlikely.
 
     Args:
-        looks: of one object, the most frontal first; at least one.
+        looks: readings of one object, the most frontal first; at least one.
     """
     answers = [look for look in looks if look.answered]
     if not answers:
@@ -38,7 +38,7 @@ def merge_views(looks: Sequence[ObjectReading]) -> ObjectReading:
 
 
 def _allows(look: ObjectReading, answer: ObjectReading) -> bool:
-    """Whether a view's reading is compatible with `answer`."""
+    """Return whether a view's reading is compatible with `answer`."""
     if look.answered:
         if look.text is not None or look.state is not None:
             return (look.text, look.state) == (answer.text, answer.state)
@@ -51,7 +51,10 @@ def _allows(look: ObjectReading, answer: ObjectReading) -> bool:
 
 
 def _from_what_is_left(looks: Sequence[ObjectReading]) -> ObjectReading:
-    """The number that all views of a display leave possible, or the refusal of the first view in which the object showed."""
+    """Return the number that all views of a display leave possible, or a refusal.
+
+    The refusal is that of the first view that shows the object.
+    """
     first = next((look for look in looks if look.present), looks[0])
     lists = [{number.text: number.probability for number in look.possible} for look in looks if look.possible]
     if len(lists) < 2:
@@ -72,7 +75,7 @@ def _from_what_is_left(looks: Sequence[ObjectReading]) -> ObjectReading:
 
 
 def _said(look: ObjectReading) -> str:
-    """A look's answer in a word."""
+    """Return the answer of a view as a short text."""
     if look.answered:
         return look.text or look.state or f"{look.value:.4g} {look.unit}".strip()
     return " or ".join(number.text for number in look.possible)

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from hal.arrays import Image
 from hal.jit import compiled
 
-LEAST_NOISE = 0.3  # gray levels: the rounding
-ENOUGH_PX = 500_000
+LEAST_NOISE = 0.3  # gray levels; the effect of rounding
+ENOUGH_PX = 500_000  # number of pixels that is enough for the estimate
 
 
 def noise_sigma(gray: Image, *, rows_apart: int = 1) -> float:
-    """Standard deviation of the pixel noise: J. Immerkaer, CVIU 64(2), 1996, with the median for the mean.
+    """Return the standard deviation of the pixel noise: J. Immerkaer, CVIU 64(2), 1996, with the median, not the mean.
 
     Args:
-        rows_apart: every how many rows are looked at, for one in a hurry; large images: every second at least.
+        rows_apart: distance of the rows that are used, for speed; at least 2 in large images.
     """
     if min(gray.shape) < 3:
         return LEAST_NOISE
@@ -28,7 +28,7 @@ def noise_sigma(gray: Image, *, rows_apart: int = 1) -> float:
 
 @compiled
 def _response_counts(gray: Image, step: int) -> NDArray[np.int64]:
-    """How often every magnitude of the response to [1 -2 1; -2 4 -2; 1 -2 1] occurs inside every `step`-th row."""
+    """Return the histogram of the absolute response to [1 -2 1; -2 4 -2; 1 -2 1] in every `step`-th row."""
     height, width = gray.shape
     counts = np.zeros(8 * 255 + 1, np.int64)
     for v in range(1, height - 1, step):

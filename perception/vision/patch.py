@@ -1,4 +1,4 @@
-"""Rectified pictures of single objects: fronto-parallel, with known metres per pixel. Every reader works on them."""
+"""Rectified pictures of single objects: fronto-parallel, with known pixels per metre. Every reader works on them."""
 
 from __future__ import annotations
 
@@ -13,33 +13,34 @@ from hal.arrays import Array, Image
 from perception.vision.image import WHITE_LEVEL, as_gray
 from perception.vision.projection import PanelProjection, homography
 
-OVERSAMPLING = 1.5  # rectified pixels per image pixel: keeps detail through the second interpolation
-MAX_SIDE_PX = 320
-HEIGHT_STEP_M = 0.01
-BEND_NODES = 9  # a side of the grid that the lens's bend over a patch is known at; it is smooth
-LEAST_BEND_PX = 0.05
+OVERSAMPLING = 1.5  # rectified pixels per image pixel; preserves detail in the second interpolation
+MAX_SIDE_PX = 320  # largest side of a patch
+HEIGHT_STEP_M = 0.01  # difference in height by which parallax and growth are measured
+BEND_NODES = 9  # nodes along a side of the grid on which the lens distortion over a patch is known; it is smooth
+LEAST_BEND_PX = 0.05  # a smaller deviation from a homography is neglected
 
-#: Corners of a patch clockwise from the upper left, and the grid that the bend is known at, in half sizes from its middle.
+#: Corners of a patch clockwise from the upper left, and nodes of that grid, in half sizes from the middle.
 CORNERS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 NODES = np.array([[x, y] for y in np.linspace(1.0, -1.0, BEND_NODES) for x in np.linspace(-1.0, 1.0, BEND_NODES)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Patch:
-    """An object seen from straight ahead.
+    """Rectified picture of an object, as seen from straight ahead.
 
     Object frame: origin at the object's middle, x right, y up, z towards the viewer, metres. The patch shows the plane
-    `plane_z_m` undistorted; what stands `dz` above it appears shifted by `parallax_px_per_m * dz`.
+    `plane_z_m` undistorted; a point `dz` above it appears shifted by `parallax_px_per_m * dz`.
 
     Attributes:
         gray: (H, W) uint8.
         colour: (H, W, 3) RGB, or None for a gray camera.
-        inside: (H, W) bool, False where the image did not reach.
+        inside: (H, W) bool, False where the patch is outside the image.
         px_per_m: patch pixels per metre.
-        image_px_per_m: original image pixels per metre: the true resolution.
-        origin_px: (2,) where the object's middle at `plane_z_m` lies, u and v.
+        image_px_per_m: original image pixels per metre, the true resolution.
+        origin_px: (2,) u and v of the object's middle at `plane_z_m`.
         parallax_px_per_m: (2,) shift in the patch per metre of height.
-        growth_per_m: relative magnification per metre of height: one over the camera's distance; 0 in a plane view.
+        growth_per_m: relative magnification per metre of height, the inverse of the camera's distance; 0 for a
+        homography.
     """
 
     gray: Image
@@ -53,7 +54,7 @@ class Patch:
     plane_z_m: float
 
     def pixel_of(self, x_m: ArrayLike, y_m: ArrayLike, z_m: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Patch coordinates (u, v) of object points; `z_m` defaults to the patch's plane."""
+        """Return the patch coordinates (u, v) of object points; `z_m` is the patch's plane by default."""
         dz = np.asarray(0.0 if z_m is None else np.asarray(z_m, float) - self.plane_z_m)
         scale = self.px_per_m * (1.0 + self.growth_per_m * dz)
         u = self.origin_px[0] + scale * np.asarray(x_m, float) + self.parallax_px_per_m[0] * dz
@@ -61,19 +62,19 @@ class Patch:
         return u, v
 
     def sample(self, x_m: ArrayLike, y_m: ArrayLike, z_m: ArrayLike | None = None) -> NDArray[np.float32]:
-        """Gray values (bilinear, float32) at object points of any common shape of one or two dimensions."""
+        """Return gray values (bilinear, float32) at object points of any common shape of one or two dimensions."""
         u, v = self.pixel_of(x_m, y_m, z_m)
         return sample_at(self.gray, u, v)
 
     def seen(self, x_m: ArrayLike, y_m: ArrayLike, z_m: ArrayLike | None = None) -> float:
-        """Share of the object points that lie inside the image and are not saturated."""
+        """Return the share of the object points that lie inside the image and are not saturated."""
         u, v = self.pixel_of(x_m, y_m, z_m)
         good = (self.inside & (self.gray < WHITE_LEVEL)).astype(np.uint8)
         return float(sample_at(good, u, v).mean())
 
 
 def sample_at(image: NDArray[Any], u: Array, v: Array, *, outside: float | None = None) -> NDArray[np.float32]:
-    """Bilinear values at coordinates of one or two dimensions; the border repeats unless `outside` is given."""
+    """Return bilinear values at coordinates of one or two dimensions; the border repeats unless `outside` is given."""
     u32, v32 = np.atleast_2d(u).astype(np.float32), np.atleast_2d(v).astype(np.float32)
     border = cv2.BORDER_REPLICATE if outside is None else cv2.BORDER_CONSTANT
     values = cv2.remap(
@@ -93,12 +94,12 @@ def rectify(
     shift_px: ArrayLike = (0.0, 0.0),
     gray: Image | None = None,
 ) -> Patch:
-    """The patch of `centre_m` (x, y on the plate) out to the half sizes, at height `plane_z_m`.
+    """Return the patch around `centre_m` (x, y on the plate) with the given half sizes, at height `plane_z_m`.
 
     Args:
         image: (H, W) or (H, W, 3) uint8.
-        shift_px: (2,) what the object's own registration found: added to the projected points.
-        gray: the gray version of `image`, to save its making.
+        shift_px: (2,) shift found by the object's own registration; it is added to the projected points.
+        gray: the gray version of `image`, if it is already known.
     """
     half = np.array([half_width_m, half_height_m])
     places = np.vstack([CORNERS, CORNERS, NODES]) * half + np.asarray(centre_m, float)
@@ -131,14 +132,15 @@ def rectify(
 
 
 def _in_patch(places: Array, middle_px: Array) -> Array:
-    """(N, 2) patch coordinates of places given in half sizes from the middle, y up."""
+    """Return the patch coordinates (N, 2) of points given in half sizes from the middle, y up."""
     return np.asarray(middle_px + places * np.array([1.0, -1.0]) * middle_px, float)
 
 
 def _bend(missed_px: Array) -> NDArray[np.float32] | None:
-    """What a homography through the corners misses at the `NODES`, image px, as a grid; None when that is little.
+    """Return the deviation from a homography through the corners at the `NODES`, image px, as a grid.
 
-    Towards the border of a view a lens with k1 = -0.08 bends a slider's track by more than a pixel.
+    None if it is small. Near the border of a view, distortion of k1 = -0.08 bends a slider's track by more than a
+    pixel.
     """
     if not np.isfinite(missed_px).all() or np.abs(missed_px).max() < LEAST_BEND_PX:
         return None
@@ -146,6 +148,7 @@ def _bend(missed_px: Array) -> NDArray[np.float32] | None:
 
 
 def _warp(image: Image, patch_from_image: Array, size: tuple[int, int], bend_px: NDArray[np.float32] | None) -> Image:
+    """Return the image as a patch of `size`, through the homography and the deviation from it."""
     if bend_px is None:
         flags = cv2.INTER_LINEAR
         return np.asarray(
@@ -158,7 +161,7 @@ def _warp(image: Image, patch_from_image: Array, size: tuple[int, int], bend_px:
 def _places(
     patch_from_image: Array, size: tuple[int, int], bend_px: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Image coordinates u and v, each (H, W), of every patch pixel: through the homography, plus the bend."""
+    """Return the image coordinates u and v, each (H, W), of every patch pixel: homography plus deviation from it."""
     to_nodes = np.array([[(BEND_NODES - 1) / (size[0] - 1), 0.0, 0.0], [0.0, (BEND_NODES - 1) / (size[1] - 1), 0.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     bend = cv2.warpAffine(bend_px, to_nodes, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
@@ -173,6 +176,7 @@ def _places(
 def _inside(
     shape: tuple[int, ...], patch_from_image: Array, image_from_patch: Array, size: tuple[int, int]
 ) -> NDArray[np.bool_]:
+    """Return which pixels of the patch (H, W) lie inside the image."""
     corners = np.array([[0, 0], [size[0] - 1, 0], [size[0] - 1, size[1] - 1], [0, size[1] - 1]], float)
     back = _apply(image_from_patch, corners)
     if (back >= 0).all() and (back[:, 0] <= shape[1] - 1).all() and (back[:, 1] <= shape[0] - 1).all():
@@ -182,10 +186,12 @@ def _inside(
 
 
 def _apply(h: Array, points: Array) -> Array:
+    """Return the points (N, 2) transformed by a homography."""
     u = np.column_stack([points, np.ones(len(points))]) @ h.T
     return np.asarray(u[:, :2] / u[:, 2:])
 
 
 def _area(quad: Array) -> float:
+    """Return the area of a quadrangle."""
     x, y = quad.T
     return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)

@@ -1,6 +1,6 @@
-"""Projection of panel points to pixels: through a calibrated camera with a pose, or through a homography of the plate.
+"""Projection of panel points to pixels: by a calibrated camera with a known pose, or by a homography of the plate.
 
-Both views can be moved by a small parameter vector with a prior, so that registration is the same for both.
+Both kinds of view can be moved by a few parameters with a prior, so that registration is the same for both.
 """
 
 from __future__ import annotations
@@ -18,43 +18,46 @@ from hal.geometry import UncertainPose, perturbed
 
 
 class PanelProjection(Protocol):
-    """Projection of panel points (m, panel frame, z towards the viewer) to pixels, with small uncertain motion."""
+    """Projection of panel points (m, panel frame, z towards the viewer) to pixels, with a small uncertain motion."""
 
     @property
     def prior_sigma(self) -> Array:
-        """(n,) one sigma of every motion parameter."""
+        """Prior standard deviation (n,) of every motion parameter."""
         ...
 
     def project(self, points_m: ArrayLike) -> Array:
-        """(N, 2) pixels of (N, 3) panel points; NaN behind the camera."""
+        """Return the pixels (N, 2) of panel points (N, 3); NaN behind the camera."""
         ...
 
     def moved(self, delta: Array) -> Self:
-        """The view after a motion by (n,) parameters."""
+        """Return the view after a motion with parameters `delta` (n,)."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraProjection:
-    """A calibrated camera before the panel; moves by `delta = (d, r)` of hal.geometry, m and rad, camera axes."""
+    """A calibrated camera in front of the panel.
+
+    It moves by `delta = (d, r)` of hal.geometry, m and rad, camera axes.
+    """
 
     intrinsics: CameraIntrinsics
     camera_from_panel: UncertainPose
 
     @property
     def prior_sigma(self) -> Array:
-        """One sigma of the pose, floored so that an exact pose may still follow the building tolerance."""
+        """Standard deviations (6,) of the pose, at least as large as the building tolerance requires."""
         floor = np.array([2e-4, 2e-4, 5e-4, 5e-4, 5e-4, 5e-4])
         return np.asarray(np.maximum(np.sqrt(np.diag(self.camera_from_panel.covariance)), floor))
 
     def project(self, points_m: ArrayLike) -> Array:
-        """(N, 2) pixels of (N, 3) panel points."""
+        """Return the pixels (N, 2) of panel points (N, 3)."""
         points = self.camera_from_panel.parent_from_child.apply(np.asarray(points_m, float))
 
         return np.asarray(project(points, self.intrinsics))
 
     def moved(self, delta: Array) -> CameraProjection:
-        """The view with the pose perturbed by `delta` (6,)."""
+        """Return the view with the pose perturbed by `delta` (6,)."""
         pose = perturbed(self.camera_from_panel.parent_from_child, delta)
         return CameraProjection(
             intrinsics=self.intrinsics,
@@ -64,14 +67,14 @@ class CameraProjection:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlateProjection:
-    """A homography from the plate (x, y in m, y up) to pixels: heights do not matter.
+    """A homography from the plate (x, y in m, y up) to pixels, which ignores heights.
 
-    Moves by the shifts (px) of four control points, so that the prior is in pixels.
+    It moves by the shifts (px) of four control points, so its prior is in pixels.
 
     Attributes:
         px_from_plate: (3, 3).
         corners_m: (4, 2) the control points on the plate.
-        sigma_px: one sigma of every control point's coordinate.
+        sigma_px: standard deviation of each coordinate of a control point.
     """
 
     px_from_plate: Array
@@ -80,17 +83,17 @@ class PlateProjection:
 
     @property
     def prior_sigma(self) -> Array:
-        """One sigma of the eight corner shifts, px."""
+        """Standard deviation (8,) of the coordinates of the control points, px."""
         return np.full(8, self.sigma_px)
 
     def project(self, points_m: ArrayLike) -> Array:
-        """(N, 2) pixels of (N, 2 or 3) plate points."""
+        """Return the pixels (N, 2) of plate points (N, 2 or 3)."""
         points = np.asarray(points_m, float)[:, :2]
         u = np.column_stack([points, np.ones(len(points))]) @ self.px_from_plate.T
         return np.asarray(u[:, :2] / u[:, 2:])
 
     def moved(self, delta: Array) -> PlateProjection:
-        """The view with the control points shifted by `delta` (8,), px."""
+        """Return the view with the control points shifted by `delta` (8,), px."""
         shifted = self.project(self.corners_m) + delta.reshape(4, 2)
         return PlateProjection(
             px_from_plate=homography(self.corners_m, shifted), corners_m=self.corners_m, sigma_px=self.sigma_px
@@ -98,7 +101,7 @@ class PlateProjection:
 
 
 def homography(source: Array, target: Array) -> Array:
-    """(3, 3) homography that takes four (4, 2) source points to four target points."""
+    """Return the homography (3, 3) that maps four source points (4, 2) to four target points."""
     A = np.zeros((8, 8))
     x, y = source.T
     u, v = target.T

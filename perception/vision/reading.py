@@ -10,8 +10,8 @@ import numpy as np
 
 from hal.arrays import Array
 
-ANSWER_AT = 0.5  # below this confidence a reading is refused, unless the caller asks for less or for more
-MOST_DOUBTED = 0.49  # confidence of a guess that a reader has a reason to refuse
+ANSWER_AT = 0.5  # confidence below which a reading is refused, unless the caller asks for less or for more
+MOST_DOUBTED = 0.49  # highest confidence of a guess that a reader has a reason to refuse
 NO_EDGE = "the cap's edge cannot be found: come closer or add light"
 ALIKE = "pressed and released look alike from here: look from the side or closer"
 TOO_WEAK = "the evidence is too weak: come closer, change the angle or the light"
@@ -19,7 +19,7 @@ TOO_WEAK = "the evidence is too weak: come closer, change the angle or the light
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Possible:
-    """A number that what is seen of a refused display allows: how it is written, its value, and its probability."""
+    """A number that a refused display may show: its text, its value, and its probability."""
 
     text: str
     value: float
@@ -27,13 +27,13 @@ class Possible:
 
     @property
     def half_digit(self) -> float:
-        """Half a unit of the last digit: the uncertainty of the number as displayed."""
+        """Half a unit of the last digit, which is the uncertainty of the number as displayed."""
         return 0.5 * 10.0 ** -len(self.text.partition(".")[2])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guess:
-    """What a refusal would have said: as the fields of `Answer` of the same names."""
+    """The reading that a refusal withholds; the fields are those of `Answer` of the same names."""
 
     value: float | None = None
     uncertainty: float | None = None
@@ -43,15 +43,18 @@ class Guess:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answer:
-    """At most one of `value`, `state` and `text` leads; a refusal has none of them, and a `reason`.
+    """An answer or a refusal.
+
+    An answer has `value`, `state` or `text`; a refusal has none of them, and a `reason`.
 
     Attributes:
-        value: in `unit`; a display has its text's number here too.
-        uncertainty: one sigma of `value`, same unit.
-        confidence: 0 to 1, the expected share of right answers among such readings; of a refusal, that its guess is right.
+        value: in `unit`; for a display the number of its text.
+        uncertainty: standard deviation of `value`, same unit.
+        confidence: 0 to 1, the expected share of correct answers among such readings; of a refusal, that its guess is
+            correct.
         reason: why no answer is given and what would help; None for an answer.
-        possible: what a refused display may show, likeliest first; empty where nothing is known.
-        guess: what a refusal would have said, for callers who want less than `ANSWER_AT` (see `answer_at`).
+        possible: numbers that a refused display may show, likeliest first; empty if nothing is known.
+        guess: the reading that a refusal withholds, for callers that accept less than `ANSWER_AT` (see `answer_at`).
     """
 
     value: float | None = None
@@ -75,19 +78,19 @@ A = TypeVar("A", bound=Answer)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchReading(Answer):
-    """What a reader says of the object in its patch."""
+    """Reading of the object in a patch."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObjectReading(Answer):
-    """One object of a taught panel in one image, with what it says.
+    """Reading of one object of a taught panel in one image.
 
     Attributes:
-        present: whether something that looks like the object is where the panel file says.
-        centre_px: (2,) refined middle of the object on the image.
-        centre_m: (3,) its place in the panel frame by this image (plate height), None without a camera pose.
+        present: whether something that looks like the object is at the position in the panel file.
+        centre_px: (2,) refined middle of the object in the image.
+        centre_m: (3,) position in the panel frame according to this image, on the plate; None without a camera pose.
         centre_covariance_m2: (3, 3) of `centre_m`, panel axes.
-        outline_px: (N, 2) contour in the image, for drawing and for the robot's look.
+        outline_px: (N, 2) contour in the image, for drawing.
     """
 
     name: str
@@ -105,38 +108,40 @@ class ObjectReading(Answer):
 
     @property
     def needs_closer_sides(self) -> bool:
-        """Whether the refusal is that two states look alike from here, so that a nearer look from a side would tell."""
+        """Whether two states look alike from here, so that a nearer view from a side would help."""
         return self.reason in (NO_EDGE, ALIKE)
 
     def saying(self, status: PatchReading) -> ObjectReading:
-        """The object, found where it should be, with what its reader says of it."""
+        """Return the object as present, with the reading `status`."""
         return replace(self, present=True, **{field.name: getattr(status, field.name) for field in fields(Answer)})
 
 
 def refused(reason: str, *, unit: str = "") -> PatchReading:
-    """No answer and no guess either, with the reason (cause, then what would help)."""
+    """Return a refusal without a guess; `reason` states the cause, then what would help."""
     return PatchReading(reason=reason, unit=unit)
 
 
 def doubted(status: PatchReading, reason: str) -> PatchReading:
-    """A refusal with that reason, which keeps what the status says as its guess."""
+    """Return a refusal with that reason, with the status as its guess."""
     return answer_at(limited(status, MOST_DOUBTED), ANSWER_AT, reason)
 
 
 def gated(status: PatchReading, reason: str = TOO_WEAK, possible: tuple[Possible, ...] = ()) -> PatchReading:
-    """The same answer, or a refusal with that reason when its confidence is too low, which keeps it as its guess.
+    """Return the status unchanged, or, if its confidence is too low, a refusal with the status as its guess.
 
     Args:
-        possible: what a display may show if it is refused.
+        reason: of the refusal.
+        possible: numbers that a display may show if it is refused.
     """
     refusal = answer_at(status, ANSWER_AT, reason)
     return replace(refusal, possible=possible) if possible and refusal.guess else refusal
 
 
 def as_often_right(status: PatchReading, least: float) -> PatchReading:
-    """The same status; a guess's confidence is stretched to the range from `least`, what it is worth without any evidence.
+    """Return the status with the confidence of a guess mapped to a range that begins at `least`.
 
-    Readers are made to tell when to refuse; what they say below that is too low for kinds with few states.
+    `least` is the share of guesses that are correct without any evidence. The confidence of readers is meant for
+    deciding about refusals; for guesses of kinds with few states it is too low.
     """
     if status.guess is None:
         return status
@@ -144,7 +149,10 @@ def as_often_right(status: PatchReading, least: float) -> PatchReading:
 
 
 def answer_at(answer: A, least_confidence: float, reason: str = TOO_WEAK) -> A:
-    """The same answer for a caller to whom so much confidence is enough: guesses become answers, doubtful answers guesses."""
+    """Return the answer for a caller that requires the given confidence.
+
+    Guesses that reach it become answers, and answers below it become refusals with a guess.
+    """
     if answer.reason is None and answer.confidence < least_confidence:
         return replace(
             answer, value=None, uncertainty=None, state=None, text=None, reason=reason, guess=_guess_of(answer),
@@ -157,27 +165,29 @@ def answer_at(answer: A, least_confidence: float, reason: str = TOO_WEAK) -> A:
 
 
 def _guess_of(answer: Answer) -> Guess:
+    """Return the fields of an answer as a guess."""
     return Guess(**{field.name: getattr(answer, field.name) for field in fields(Guess)})
 
 
 def _alone(answer: Answer) -> tuple[Possible, ...]:
-    """What a display may show of which one number is known."""
+    """Return the number of a display's answer as the only possible one; nothing for other objects."""
     if answer.text is None or answer.value is None:
         return ()
     return (Possible(text=answer.text, value=answer.value, probability=answer.confidence),)
 
 
 def probability(evidence: Sequence[tuple[float, float, float]]) -> float:
-    """Confidence from independent pieces of evidence by a logistic sum.
+    """Return the confidence from independent pieces of evidence, by a logistic sum.
 
     Args:
-        evidence: `(measured, half, scale)` triples: each adds `(measured - half) / scale`. Doubt counts up to -6,
-            assurance up to +1: no strong point outweighs a weak one.
+        evidence: triples `(measured, half, scale)`, each of which adds `(measured - half) / scale`, limited to -6 and
+        +1:
+            strong evidence for an answer cannot outweigh evidence against it.
     """
     total = sum(float(np.clip((measured - half) / scale, -6.0, 1.0)) for measured, half, scale in evidence)
     return float(1.0 / (1.0 + np.exp(-total)))
 
 
 def limited(status: PatchReading, most: float) -> PatchReading:
-    """The same status with a confidence of at most `most`."""
+    """Return the status with a confidence of at most `most`."""
     return status if status.confidence <= most else replace(status, confidence=most)

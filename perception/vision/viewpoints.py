@@ -1,6 +1,6 @@
-"""Camera poses for viewing the panel: square in front, near enough to read, far enough to see everything.
+"""Camera poses for views of the panel: frontal, near enough to read, far enough to show everything.
 
-Every function gives `base_from_camera` poses, best first; the caller takes the first that its arm can reach.
+Every function returns `base_from_camera` poses, best first; the caller takes the first that its arm can reach.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from hal.calibration import CameraIntrinsics
 from hal.geometry import transform
 from hal.panel import Panel, PanelObject
 
-FILL = 0.85  # share of the image that the target may fill: pose and mount are not exact
-CLOSE_UP_M = 0.30  # at 460 px focal length a 36 mm gauge face is 110 px wide
-SIDES = {  # turns about the panel's x and y; round the object, for the way across it is half as long again
+FILL = 0.85  # share of the image that the target may fill, because pose and mount are not exact
+CLOSE_UP_M = 0.30  # at a focal length of 460 px a gauge's face of 36 mm is then 110 px wide
+SIDES = {  # rotations about the panel's x and y, in order around the object: the way across is 1.5 times as long
     "the right": (0.0, 1.0),
     "below": (1.0, 0.0),
     "the left": (0.0, -1.0),
     "above": (-1.0, 0.0),
 }
-SIDE_RAD = (0.42, 0.32)  # readers stand a tilt of 0.5; a cable 30 mm before a display moves by 13 mm
-NEAR_M = 0.25  # aslant the fingers reach 10 cm ahead of the camera
+SIDE_RAD = (0.42, 0.32)  # readers tolerate a tilt of 0.5; a cable 30 mm in front of a display appears shifted by 13 mm
+NEAR_M = 0.25  # at such a tilt the fingers extend 10 cm beyond the camera
 NEAR_SIDES = {"close by below": (0.45, 0.0), "close by the right": (0.0, 0.2)}  # tilts, rad
-CLOSE_SIDES = (*NEAR_SIDES, "the right")  # for two states that look alike from further off
-REACH_M = 0.045  # half size that a close-up leaves round an object's middle
+CLOSE_SIDES = (*NEAR_SIDES, "the right")  # for two states that look alike from farther away
+REACH_M = 0.045  # half size of the area around an object that a close-up must show
 
 
 def facing(
@@ -39,12 +39,12 @@ def facing(
     roll_rad: float = 0.0,
     tilt_rad: tuple[float, float] = (0.0, 0.0),
 ) -> RigidTransform:
-    """`base_from_camera` that looks at a panel point along the panel's normal.
+    """Return `base_from_camera` that looks at a panel point along the panel's normal.
 
     Args:
         point_m: (3,) in the panel frame.
-        roll_rad: turn of the camera about its view.
-        tilt_rad: how far the camera stands off the normal, about the panel's x and y axes.
+        roll_rad: rotation of the camera about its line of sight.
+        tilt_rad: rotation of the line of sight from the normal, about the panel's x and y axes.
     """
     upright = np.diag([1.0, -1.0, -1.0])  # camera x along panel x, camera z into the panel
     stand = Rotation.from_euler("xyz", [tilt_rad[0], tilt_rad[1], 0.0])
@@ -55,7 +55,7 @@ def facing(
 
 
 def overview_distance_m(panel: Panel, intrinsics: CameraIntrinsics, slack_m: float) -> float:
-    """How far the camera must stand back to have the whole plate in view, wherever it is within `slack_m`."""
+    """Return the distance at which the camera sees the whole plate, wherever the plate is within `slack_m`."""
     half_view_x = FILL * min(intrinsics.cx_px, intrinsics.width_px - intrinsics.cx_px) / intrinsics.fx_px
     half_view_y = FILL * min(intrinsics.cy_px, intrinsics.height_px - intrinsics.cy_px) / intrinsics.fy_px
     return max((panel.width_m / 2 + slack_m) / half_view_x, (panel.height_m / 2 + slack_m) / half_view_y)
@@ -64,7 +64,7 @@ def overview_distance_m(panel: Panel, intrinsics: CameraIntrinsics, slack_m: flo
 def overview_poses(
     base_from_panel: RigidTransform, panel: Panel, intrinsics: CameraIntrinsics, slack_m: float
 ) -> Iterator[RigidTransform]:
-    """Camera poses that see the whole panel, best first: square on, then from further off, then from the side."""
+    """Yield camera poses that see the whole panel, best first: frontal, at other distances, then from the side."""
     distance_m = overview_distance_m(panel, intrinsics, slack_m)
     for tilt_x in (0.0, 0.2, -0.2, 0.35, -0.35):
         for stretch in (1.0, 0.92, 1.1):
@@ -73,7 +73,7 @@ def overview_poses(
 
 
 def close_up_poses(base_from_panel: RigidTransform, point_m: Sequence[float]) -> Iterator[RigidTransform]:
-    """Camera poses for reading what lies about one panel point, best first."""
+    """Yield camera poses for reading the objects around a panel point, best first."""
     for distance_m in (CLOSE_UP_M, 0.34, 0.38):
         for tilt in ((0.0, 0.0), (0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12), (0.22, 0.0), (-0.22, 0.0)):
             for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
@@ -83,9 +83,10 @@ def close_up_poses(base_from_panel: RigidTransform, point_m: Sequence[float]) ->
 def side_poses(
     base_from_panel: RigidTransform, point_m: Sequence[float], turns: tuple[float, float]
 ) -> Iterator[RigidTransform]:
-    """Camera poses that look at a panel point from one of the `SIDES`, past what hides it from straight ahead.
+    """Yield camera poses that look at a panel point from one of the `SIDES`, past an occluder in front of it.
 
-    From further off than a close-up: what hides it hangs before the panel, and aslant the fingers come nearer to that.
+    They are farther away than a close-up, because the occluder hangs in front of the panel, and at a tilt the fingers
+    come nearer to it. `turns`: the value in `SIDES`.
     """
     for distance_m in (0.34, 0.38, CLOSE_UP_M):
         for lean_rad in SIDE_RAD:
@@ -95,7 +96,7 @@ def side_poses(
 
 
 def poses_from(base_from_panel: RigidTransform, point_m: Sequence[float], side: str) -> Iterator[RigidTransform]:
-    """Camera poses from one of the `SIDES` or `NEAR_SIDES`, best first."""
+    """Yield camera poses from one of the `SIDES` or `NEAR_SIDES`, best first."""
     if side in SIDES:
         yield from side_poses(base_from_panel, point_m, SIDES[side])
         return
@@ -106,9 +107,9 @@ def poses_from(base_from_panel: RigidTransform, point_m: Sequence[float], side: 
 def close_up_groups(
     objects: Sequence[PanelObject], intrinsics: CameraIntrinsics, distance_m: float = CLOSE_UP_M
 ) -> list[tuple[Array, tuple[str, ...]]]:
-    """Few close-ups that together show every object: (view centre in the panel frame, names), the fullest first.
+    """Return a few close-ups that together show every object, as pairs (view centre in the panel frame, names).
 
-    Greedy cover: each view is centred where it takes in most of the objects that are still unseen.
+    Greedy cover: each view is centred so that it shows as many of the objects as possible that no earlier view shows.
     """
     half_x = FILL * 0.5 * intrinsics.width_px / intrinsics.fx_px * distance_m - REACH_M
     half_y = FILL * 0.5 * intrinsics.height_px / intrinsics.fy_px * distance_m - REACH_M

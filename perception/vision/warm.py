@@ -1,4 +1,4 @@
-"""Compile, or load from the cache, the functions of displays and pointers, so that the first reading is as fast as later ones."""
+"""Compilation of the vision kernels in advance, or loading them from the cache, so that the first reading is fast."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from perception.vision.status.display import read_window
 
 DIGIT_PX = (72, 40)  # height and width
 STROKE_PX = 8
-DIAL_PX = 110  # half of the picture
+DIAL_PX = 110  # half side of the picture
 
 
 def warm_up() -> None:
-    """Run the compiled functions of the light search, the pose of four lights, the display and the pointer reader once."""
+    """Run the light search, the pose of four lights, and the display and pointer readers once."""
     quadrangle.warm_up()
     lights.warm_up()
     window = three_eights()
@@ -28,7 +28,7 @@ def warm_up() -> None:
 
 
 def upright_pointer() -> NDArray[np.uint8]:
-    """A black pointer on a bright round face."""
+    """Return a picture of a black pointer on a bright round face."""
     v, u = np.mgrid[-DIAL_PX:DIAL_PX, -DIAL_PX:DIAL_PX]
     face = np.where(np.hypot(u, v) < 0.95 * DIAL_PX, 200, 60)
     face[(abs(u) < 0.04 * DIAL_PX) & (v < 0.1 * DIAL_PX) & (v > -0.8 * DIAL_PX)] = 20
@@ -36,7 +36,7 @@ def upright_pointer() -> NDArray[np.uint8]:
 
 
 def three_eights() -> NDArray[np.uint8]:
-    """Black digits with all segments lit, and a point, on gray."""
+    """Return a picture of black digits with all segments lit, and a decimal point, on gray."""
     (height, width), stroke = DIGIT_PX, STROKE_PX
     eight = np.full((height, width), 200, np.uint8)
     for top in (0, (height - stroke) // 2, height - stroke):

@@ -249,7 +249,7 @@ def chosen(
 
 
 def _is_taken(place: Array, reach: float, taken: Sequence[tuple[float, float, float]]) -> bool:
-    """Whether an object of that reach overlaps an accepted one."""
+    """Return whether an object of that reach overlaps an accepted one."""
     return any(max(abs(place[0] - a), abs(place[1] - b)) < 0.475 * max(reach, c) for a, b, c in taken)
 
 

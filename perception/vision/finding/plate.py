@@ -108,13 +108,13 @@ class _Search:
         return best if best is not None and self._is_plate(best) else None
 
     def _is_plate(self, view: PlateProjection) -> bool:
-        """Whether edges confirm enough of the border, and the plate's proportions are possible for the camera."""
+        """Return whether edges confirm enough of the border and the camera allows the plate's proportions."""
         visible, near = (int(mask.sum()) for mask in confirmed(self.image, view, self.outline))
         is_confirmed = near >= max(LEAST_CONFIRMED, LEAST_SHARE_CONFIRMED * visible)
         return is_confirmed and self._stretch(view) < MOST_STRETCHED
 
     def is_sure(self, view: PlateProjection) -> bool:
-        """Whether edges confirm nearly all of the visible border, on three sides at least: two leave the size open."""
+        """Return whether edges confirm nearly all of the visible border; its size requires at least three sides."""
         visible, near = (mask.reshape(4, -1).sum(axis=1) for mask in confirmed(self.image, view, self.outline))
         sides = (visible >= SURE_SIDE_VISIBLE) & (2 * near > visible)
         return bool(sides.sum() >= SURE_SIDES and near.sum() >= SURE_SHARE * visible.sum())

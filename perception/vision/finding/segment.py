@@ -73,7 +73,7 @@ def _root(parent: NDArray[np.int32], k: int) -> int:
 
 @inlined
 def _fits(n: np.int64, total: np.int64, squares: np.int64, value: np.int64, tolerance: float) -> bool:
-    """Whether a gray value belongs to a region: |I - mean| <= max(tolerance, SPREADS * sigma), no roots."""
+    """Return whether a gray value belongs to a region: |I - mean| <= max(tolerance, SPREADS * sigma), no roots."""
     d = abs(value * n - total)  # n |I - mean|: no division on the common path
     if d <= tolerance * n:
         return True

@@ -40,7 +40,7 @@ class PanelPrior:
     angle_tolerance_rad: float = np.inf
 
     def allows(self, camera_from_panel: RigidTransform) -> bool:
-        """Whether the panel can be there."""
+        """Return whether the panel can be there."""
         offset = self.offset(camera_from_panel)
         return bool(
             np.linalg.norm(offset[:3]) <= CORNER * self.position_tolerance_m

@@ -168,7 +168,7 @@ def cell_scores(sums: Array, squares: Array, boxes: Array, width: float, lit: Ar
 
 
 def _overlap(a: DigitCell, b: DigitCell) -> bool:
-    """Whether two cells cover each other by a third or more."""
+    """Return whether two cells cover each other by a third or more."""
     across = min(a.u + a.width, b.u + b.width) - max(a.u, b.u)
     down = min(a.v + a.height, b.v + b.height) - max(a.v, b.v)
     return across > 0 and down > 0 and across * down > 0.33 * min(a.width * a.height, b.width * b.height)

@@ -1,7 +1,7 @@
 """Pose of four known points in one image: `estimate`, with covariance, mirror poses and an ambiguity flag.
 
-`three_point` gives the poses of three points, `minima` every minimum of `cost`, `posterior` their odds, and `search`
-combines them. All modules below `pose` are compiled.
+`three_point` computes the poses of three points, `minima` finds every local minimum of `cost`, `posterior` computes the
+probability of a mirror pose, and `search` combines them. All these modules are compiled; `pose` is their interface.
 """
 
 from perception.vision.quadrangle.pose import AlternativePose, QuadranglePose, estimate, warm_up

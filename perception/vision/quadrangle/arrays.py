@@ -1,4 +1,4 @@
-"""Compiled array routines of the four-light pose: pixels to ideal coordinates, the object's plane, covariances."""
+"""Compiled array routines of the pose of four points: pixels to ideal coordinates, the object's plane, covariances."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from perception.vision.quadrangle.three_point import cofactors, real_cubic_root
 
 @compiled
 def prepare(pixels: Array, covariance: Array, camera: Array, m: Array, A: Array) -> int:
-    """Pixels (N, 2) with covariance (N, 2, 2) to ideal normalised coordinates m and information A (N, 3).
+    """Convert pixels (N, 2) with covariance (N, 2, 2) to ideal normalised coordinates m and their information A (N, 3).
 
-    `camera`: fx, fy, cx, cy, k1, k2, p1, p2, k3. The lens is inverted by Newton's method, see `camera_model`.
+    `camera` (9,): fx, fy, cx, cy, k1, k2, p1, p2, k3. The lens distortion is inverted by Newton's method, see
+    `camera_model`.
 
-    Returns: -1, or the index of a point that the lens model cannot have produced, or N + index of a covariance that is
-    not positive definite.
+    Returns: -1 if all is well; the index of a point that the lens model cannot have produced; or N + the index of a
+    covariance that is not symmetric positive definite.
     """
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
@@ -64,7 +65,10 @@ def prepare(pixels: Array, covariance: Array, camera: Array, m: Array, A: Array)
 
 @inlined
 def plane_of(X: Array) -> tuple[Array, float]:
-    """Unit normal of the plane nearest to centred points X (N, 3), and their spread across their main line (m^2)."""
+    """Return the unit normal of the plane nearest to centred points X (N, 3), and their spread in this plane (m^2).
+
+    The spread is that perpendicular to their main direction; it is zero for points on a line.
+    """
     M = np.zeros((3, 3))
     for n in range(X.shape[0]):
         for i in range(3):
@@ -97,7 +101,7 @@ def plane_of(X: Array) -> tuple[Array, float]:
 
 @compiled
 def inverse6(N: Array, out: Array) -> bool:
-    """Inverse of a positive definite 6x6 matrix, column by column; False when it is not."""
+    """Compute the inverse of a 6x6 matrix into `out`; returns False if the matrix is not positive definite."""
     g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
     for k in range(6):
         for i in range(6):
@@ -115,7 +119,7 @@ def inverse6(N: Array, out: Array) -> bool:
 
 @inlined
 def log_det6(C: Array) -> float:
-    """Log determinant of a positive definite 6x6 matrix."""
+    """Return the log determinant of a positive definite 6x6 matrix."""
     g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
     solve_damped(C, C, 0.0, g, x, L)
     total = 0.0
@@ -126,7 +130,7 @@ def log_det6(C: Array) -> float:
 
 @inlined
 def move_origin(C: Array, lever: Array) -> None:
-    """Covariance for the origin at -lever (camera axes) of the point it was for: d <- d + [lever]x r, in place."""
+    """Convert the covariance C of a pose to the origin at -lever (camera axes): d <- d + [lever]x r, in place."""
     for _ in range(2):  # J C, then (J (J C)^T)^T by the same loop on the transpose
         for k in range(6):
             r0, r1, r2 = C[3, k], C[4, k], C[5, k]

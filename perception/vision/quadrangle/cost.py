@@ -1,8 +1,8 @@
-"""Compiled inner loops of the four-light pose: reprojection chi-square, its derivatives and its local minimiser.
+"""Compiled inner loops of the pose of four points: reprojection chi-square, its derivatives and a local minimiser.
 
-Everything works on normalised image coordinates `m` (4, 2) with information `A` (4, 3) = (a_uu, a_uv, a_vv) each and
-on object points `X` (4, 3) whose centroid is the origin. A pose is `R` (3, 3) and `t` (3,), camera_from_object;
-perturbations are ordered translation then rotation: t <- t + d, R <- Exp(w) R. Costs are chi-squares.
+Points in the image are normalised coordinates `m` (4, 2) with information `A` (4, 3) = (a_uu, a_uv, a_vv) each; object
+points are `X` (4, 3), with the origin at their centroid. A pose is `R` (3, 3) and `t` (3,), camera_from_object.
+Perturbations are ordered translation, then rotation: t <- t + d, R <- Exp(w) R. Costs are chi-squares.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from hal.arrays import Array
 from hal.jit import compiled, inlined
 from perception.vision.quadrangle.small_vectors import cross3, mix3, product3
 
-CONVERGED = 1e-9  # predicted fall of chi-square: 3e-5 of a standard deviation
+CONVERGED = 1e-9  # predicted decrease of chi-square at which to stop: 3e-5 of a standard deviation
 MAX_STEPS = 60
 
 
 @inlined
 def rotation_of(w: Array) -> Array:
-    """Exp of a rotation vector (Rodrigues)."""
+    """Return the rotation matrix of a rotation vector (Rodrigues)."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
     s = 1.0 - angle2 / 6.0 if angle < 1e-4 else np.sin(angle) / angle
@@ -40,7 +40,7 @@ def rotation_of(w: Array) -> Array:
 
 @inlined
 def turn_onto(a: Array, b: Array) -> Array:
-    """The smallest rotation that carries unit vector a onto unit vector b (not its opposite)."""
+    """Return the smallest rotation that turns unit vector a onto unit vector b, which must not be opposite to a."""
     v = cross3(a, b)
     c = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     k = 1.0 / (1.0 + c)
@@ -60,7 +60,7 @@ def turn_onto(a: Array, b: Array) -> Array:
 
 @compiled
 def chi_square(R: Array, t: Array, X: Array, m: Array, A: Array) -> float:
-    """Reprojection chi-square of a pose; infinite when a point is behind the camera."""
+    """Return the reprojection chi-square of a pose; infinite if a point is behind the camera."""
     total = 0.0
     for i in range(X.shape[0]):
         z = R[2, 0] * X[i, 0] + R[2, 1] * X[i, 1] + R[2, 2] * X[i, 2] + t[2]
@@ -74,7 +74,10 @@ def chi_square(R: Array, t: Array, X: Array, m: Array, A: Array) -> float:
 
 @compiled
 def expand(R: Array, t: Array, X: Array, m: Array, A: Array, g: Array, N: Array, H: Array) -> float:
-    """Chi-square; fills half its gradient g (6,), Gauss-Newton matrix N and half the exact Hessian H (6, 6)."""
+    """Return the chi-square; fills its derivatives with respect to the pose.
+
+    These are half the gradient g (6,), the Gauss-Newton matrix N (6, 6) and half the exact Hessian H (6, 6).
+    """
     for a in range(6):
         g[a] = 0.0
         for b in range(6):
@@ -127,9 +130,10 @@ def expand(R: Array, t: Array, X: Array, m: Array, A: Array, g: Array, N: Array,
 
 @inlined
 def bend(y0: float, y1: float, y2: float, iz: float, u: float, v: float, lu: float, lv: float, H: Array) -> None:
-    """Adds to H (lower triangle) what one point gives beyond Gauss-Newton: l_u d2u + l_v d2v.
+    """Add to H (lower triangle) the second-order terms of one point that Gauss-Newton neglects: l_u d2u + l_v d2v.
 
-    Hq of the projection has only its last row and column; [-y]x = [[0, y2, -y1], [-y2, 0, y0], [y1, -y0, 0]].
+    Hq, the Hessian of the projection, has only a last row and column; [-y]x = [[0, y2, -y1], [-y2, 0, y0], [y1, -y0,
+    0]].
     """
     iz2 = iz * iz
     hx = -lu * iz2
@@ -153,7 +157,7 @@ def bend(y0: float, y1: float, y2: float, iz: float, u: float, v: float, lu: flo
     H[3, 2] += m20
     H[4, 2] += m21
     H[5, 2] += m22
-    # ([-y]x)^T Hq [-y]x + (g y^T + y g^T)/2 - (g . y) I, with g the slope along the point
+    # ([-y]x)^T Hq [-y]x + (g y^T + y g^T)/2 - (g . y) I, with g the gradient with respect to the point
     gx = lu * iz
     gy = lv * iz
     gz = -(lu * u + lv * v) * iz
@@ -168,7 +172,10 @@ def bend(y0: float, y1: float, y2: float, iz: float, u: float, v: float, lu: flo
 
 @compiled
 def solve_damped(M: Array, D: Array, damping: float, g: Array, x: Array, L: Array) -> bool:
-    """x = -(M + damping diag(D))^-1 g by Cholesky; False when that matrix is not positive definite."""
+    """Compute x = -(M + damping diag(D))^-1 g by Cholesky decomposition; returns False if it is not positive definite.
+
+    The factor is left in L.
+    """
     n = g.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -198,9 +205,10 @@ def solve_damped(M: Array, D: Array, damping: float, g: Array, x: Array, L: Arra
 
 @compiled
 def minimise(R: Array, t: Array, X: Array, m: Array, A: Array) -> tuple[Array, Array, float, Array, int]:
-    """The local minimum of chi-square below a start: damped Newton, Gauss-Newton where the Hessian is indefinite.
+    """Find the local minimum of chi-square near a start by damped Newton steps.
 
-    Gauss-Newton alone crawls near fronto-parallel, where two minima merge.
+    Where the Hessian is indefinite, a Gauss-Newton step is taken instead. Gauss-Newton alone converges slowly near
+    fronto-parallel poses, where two minima merge.
 
     Returns: R, t, chi-square, Gauss-Newton matrix (6, 6), steps taken.
     """

@@ -1,5 +1,5 @@
 # ruff: noqa: PLR0912 - a compiled loop keeps one equation in one place
-"""Compiled search for every local minimum of the four-light reprojection error. Conventions as in `cost`."""
+"""Compiled search for every local minimum of the reprojection error of four points. Conventions are those of `cost`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perception.vision.quadrangle.three_point import three_point
 
 @inlined
 def rotation_distance(A: Array, B: Array) -> float:
-    """1 - cos of the angle between two rotations, doubled: 3 - trace(A^T B)."""
+    """Return 2 (1 - cos) of the angle between two rotations: 3 - trace(A^T B)."""
     s = 3.0
     for i in range(3):
         for j in range(3):
@@ -24,9 +24,9 @@ def rotation_distance(A: Array, B: Array) -> float:
 
 @compiled
 def ordered_seeds(X: Array, f: Array, m: Array, A: Array, Rs: Array, ts: Array, costs: Array) -> int:
-    """Three-point poses of the four triples with their chi-square over all four points; returns how many.
+    """Compute the poses of the four triples of points, with the chi-square over all four points; returns their number.
 
-    Rs (16, 3, 3), ts (16, 3), costs (16,) are filled.
+    f: (4, 3) unit rays. Fills Rs (16, 3, 3), ts (16, 3), costs (16,). Triples that are nearly on a line are left out.
     """
     P, F = np.empty((3, 3)), np.empty((3, 3))
     count = 0
@@ -51,7 +51,10 @@ def ordered_seeds(X: Array, f: Array, m: Array, A: Array, Rs: Array, ts: Array, 
 
 @inlined
 def mirrored(R: Array, t: Array, normal: Array) -> Array:
-    """R with the normal (object axes) reflected about the line of sight through the centroid."""
+    """Return R with the object's normal reflected about the line of sight through the centroid.
+
+    `normal` is in the object's axes. R is returned unchanged if the normal is perpendicular to the line of sight.
+    """
     n = times3(R, normal)
     k = unit3(t)
     reflected = mix3(2.0 * dot3(n, k), k, -1.0, n)
@@ -62,9 +65,10 @@ def mirrored(R: Array, t: Array, normal: Array) -> Array:
 
 @compiled
 def all_minima(X: Array, m: Array, A: Array, normal: Array, Rs: Array, ts: Array, costs: Array, Ns: Array) -> int:
-    """Distinct local minima of chi-square, lowest first, into Rs (M,3,3), ts, costs, Ns (M,6,6); returns how many.
+    """Find the distinct local minima of chi-square, lowest first; fills Rs (M,3,3), ts, costs, Ns (M,6,6).
 
-    Starts: the best three-point pose, the mirror of its minimum, then every three-point pose far from these.
+    The starts are the best three-point pose, the mirror of its minimum, then every three-point pose that is far from
+    earlier starts and minima. Returns the number of minima; Ns are their Gauss-Newton matrices.
     """
     f = np.empty((4, 3))
     for i in range(4):

@@ -1,6 +1,7 @@
 """Pose of four lights in one image, with covariance, all alternative poses, and an ambiguity flag.
 
-Maximum likelihood on the reprojection error, from three-point and mirrored starts (paper, Section II-B, refined).
+The pose minimises the reprojection error (maximum likelihood), starting from three-point and mirrored poses (paper,
+Section II-B, refined).
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose
 from perception.vision.quadrangle.search import solve
 
-# 300x200 mm, 1 px, 2 m, 5-60 deg: flags 13 % and leaves 0.4 % unflagged; 0.02 would flag 20.5 % and leave 0.09 %.
+# Least posterior probability of other poses that is reported as ambiguity. With lights 300 x 200 mm apart, noise of
+# 1 px, 2 m away at 5 to 60 degrees, 13 % of the views are flagged and 0.4 % are wrong without a flag; 0.02 would flag
+# 20.5 % and miss 0.09 %.
 AMBIGUOUS_SHARE = 0.11
-NEAR_SIGMAS2 = 60.0  # the double well's wall is 4 times lower than its Gaussian: chi-square 15 at the line of sight
-LISTED_CHI_SQUARE = 16.0  # minima further above the best than this are not alternatives (odds below 1 in 3000)
+NEAR_SIGMAS2 = 60.0  # the wall between two minima is 4 times lower than a Gaussian: chi-square 15 at the line of sight
+LISTED_CHI_SQUARE = 16.0  # minima farther above the best are not listed as alternatives (odds below 1 in 3000)
 MOST_POSES = 7
 
 
@@ -30,11 +33,12 @@ class AlternativePose:
     """Another pose that the same image allows.
 
     Attributes:
-        rotation, translation_m: (3, 3) and (3,) of the pose; `camera_from_object` gives it as a `RigidTransform`.
-        covariance: 6x6 as in `QuadranglePose`; None when it is no minimum of its own but the middle of what is likely
-            on the other side of the line of sight, on the flank of the answer's minimum.
+        rotation, translation_m: (3, 3) and (3,) of the pose; `camera_from_object` returns it as a `RigidTransform`.
+        covariance: 6x6 as in `QuadranglePose`. None if the pose is not a minimum: it is then the middle of the
+        posterior on
+            the other side of the line of sight, which the minimum of the answer reaches.
         chi_square: of its fit, 2 degrees of freedom.
-        odds: its posterior mass relative to the answer's (1 = equally likely).
+        odds: its posterior mass relative to that of the answer (1 = equally likely).
     """
 
     rotation: Array
@@ -45,22 +49,22 @@ class AlternativePose:
 
     @property
     def camera_from_object(self) -> RigidTransform:
-        """The pose."""
+        """The pose as a `RigidTransform`."""
         return _pose(self.rotation, self.translation_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class QuadranglePose:
-    """Where an object with four known points stands, seen from the camera.
+    """Pose of an object with four known points in the camera's frame.
 
     Attributes:
-        rotation, translation_m: (3, 3) and (3,) of the maximum-likelihood pose. `camera_from_object` gives it as a
-            `RigidTransform`, made on request because that takes as long as the estimate.
+        rotation, translation_m: (3, 3) and (3,) of the maximum-likelihood pose. `camera_from_object` returns it as a
+            `RigidTransform`; it is made on request only, because that takes as long as the estimate.
         covariance: 6x6 over (dx, dy, dz, rx, ry, rz), m and rad, in camera axes: the true pose has t + d and Exp(r) R.
-            It is the Cramer-Rao bound at the pose; near fronto-parallel the truth is wider, see `ambiguous`.
+            It is the Cramer-Rao bound at the pose; near fronto-parallel errors are larger, see `ambiguous`.
         chi_square: weighted squared reprojection error, 2 degrees of freedom.
-        probability: posterior probability that the truth is near this pose and not near one of `alternatives`.
-        ambiguous: another pose cannot be ruled out (`probability` below 0.89): one more view or touch decides.
+        probability: posterior probability that the true pose is near this one and not near one of `alternatives`.
+        ambiguous: another pose cannot be excluded (`probability` below 0.89); one more view or touch decides.
         alternatives: the other poses, most likely first.
     """
 
@@ -74,7 +78,7 @@ class QuadranglePose:
 
     @property
     def camera_from_object(self) -> RigidTransform:
-        """The maximum-likelihood pose."""
+        """The maximum-likelihood pose as a `RigidTransform`."""
         return _pose(self.rotation, self.translation_m)
 
     @property
@@ -84,7 +88,7 @@ class QuadranglePose:
 
     @property
     def p_value(self) -> float:
-        """Chance of a worse fit if model and noise are right; 0.001 means a wrong lamp, model or lens."""
+        """Probability of a worse fit if model and noise are right; 0.001 indicates a wrong lamp, model or lens."""
         return math.exp(-0.5 * self.chi_square)  # chi-square of 2 degrees of freedom
 
 
@@ -93,7 +97,7 @@ def estimate(
 ) -> QuadranglePose:
     """Estimate the pose of four points from their pixels, with all alternatives that the data allow.
 
-    Minimises sum e_i^T S_i^-1 e_i over SE(3), e_i the reprojection error; every local minimum is found and weighed by
+    Minimises sum e_i^T S_i^-1 e_i over SE(3), e_i the reprojection error; every local minimum is found and weighted by
     exp(-chi2 / 2) sqrt(det covariance). Near fronto-parallel, where the mirror pose need not be a minimum, the
     posterior over the object's normal is summed instead.
 
@@ -108,7 +112,7 @@ def estimate(
         NotObservable: the four points lie on one line or in one place.
         NotFound: no pose puts the four points in front of the camera.
 
-    Source: notes on Section II-B of the paper; Oberkampf, DeMenthon, Davis, CVIU 63(3), 1996 for the two planar minima.
+    Source: Section II-B of the paper; Oberkampf, DeMenthon, Davis, CVIU 63(3), 1996 for the two planar minima.
     """
     points, pixels, covariance = _checked(points_object_m, points_px, covariance_px)
     Rs, ts, costs = np.empty((MOST_POSES, 3, 3)), np.empty((MOST_POSES, 3)), np.empty(MOST_POSES)
@@ -143,14 +147,19 @@ def estimate(
 
 
 def warm_up() -> None:
-    """Compile (or load from the cache) what `estimate` needs, so that the first real call is as fast as the others."""
+    """Compile the kernels of `estimate`, or load them from the cache, so that its first call is fast."""
     camera = CameraIntrinsics(width_px=640, height_px=480, fx_px=500.0, fy_px=500.0, cx_px=320.0, cy_px=240.0)
     square = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]
     estimate(square, [[270.0, 190.0], [370.0, 190.0], [370.0, 290.0], [270.0, 290.0]], 0.01, camera)
 
 
 def _checked(points_object_m: ArrayLike, points_px: ArrayLike, covariance_px: ArrayLike) -> tuple[Array, Array, Array]:
-    points = np.require(points_object_m, float, ("C", "W"))  # compiled loops take no other layout
+    """Return the arguments of `estimate` as arrays; the covariance becomes (4, 2, 2).
+
+    Raises:
+        InvalidRequest: they are not usable.
+    """
+    points = np.require(points_object_m, float, ("C", "W"))  # the layout that compiled loops require
     pixels = np.require(points_px, float, ("C", "W"))
     covariance = np.asarray(covariance_px, float)
     if points.shape != (4, 3) or pixels.shape != (4, 2):
@@ -173,12 +182,14 @@ def _checked(points_object_m: ArrayLike, points_px: ArrayLike, covariance_px: Ar
 
 
 def _camera(intrinsics: CameraIntrinsics) -> Array:
+    """Return fx, fy, cx, cy and the distortion (9,), as `prepare` reads them."""
     return np.array([
         intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px, *intrinsics.distortion
     ])  # fmt: skip
 
 
 def _refuse(code: int, index: int) -> None:
+    """Raise the error that belongs to an error code of `solve`; `index` is its first result."""
     if code == 1 and index >= 4:
         raise InvalidRequest(
             f"covariance_px[{index - 4}] is not symmetric positive definite", hint="give a variance in px squared"
@@ -200,6 +211,7 @@ def _refuse(code: int, index: int) -> None:
 
 
 def _pose(R: Array, t: Array) -> RigidTransform:
+    """Return a rotation and a translation as a transform."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = R, t
     return RigidTransform.from_matrix(matrix)

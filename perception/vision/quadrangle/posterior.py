@@ -1,6 +1,6 @@
-"""Compiled posterior over the normal of the object: the profile at a given normal, and the mirror's share.
+"""Compiled posterior over the object's normal: its value at a given normal, and the share of the mirror pose.
 
-Conventions as in `cost`.
+Conventions are those of `cost`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from hal.jit import compiled, inlined
 from perception.vision.quadrangle.cost import chi_square, expand, rotation_of, solve_damped, turn_onto
 from perception.vision.quadrangle.small_vectors import back3, cross3, dot3, mix3, product3, put1, times3, unit3
 
-MIRROR_TURN_COS = 0.99619469809  # 5 degrees: normals nearer than this are one pose, not two
-RING_STEP_RAD = 0.10471975512  # 6 degrees; 2.5 degrees gave the same mass (correlation 0.999, 8000 problems)
-RING_COUNT = 12  # azimuths; 24 gave the same
+MIRROR_TURN_COS = 0.99619469809  # 5 degrees: poses whose normals are nearer than this count as one
+RING_STEP_RAD = 0.10471975512  # 6 degrees; 2.5 degrees gave the same mass (correlation 0.999 over 8000 problems)
+RING_COUNT = 12  # number of azimuths; 24 gave the same mass
 RING_END_RAD = 1.308996939  # 75 degrees
 
 
@@ -22,9 +22,9 @@ RING_END_RAD = 1.308996939  # 75 degrees
 def profile(
     R: Array, t: Array, direction: Array, X: Array, m: Array, A: Array, normal: Array
 ) -> tuple[Array, Array, float, float]:
-    """Chi-square minimised over position and roll while the object's normal points along `direction` (camera axes).
+    """Minimise chi-square over position and roll while the object's normal points along `direction` (camera axes).
 
-    Returns: R, t, chi-square, log determinant of the remaining 4x4 information.
+    Returns: R, t, chi-square, log determinant of the 4x4 information of position and roll.
     """
     n = times3(R, normal)
     if dot3(n, direction) > -0.99:
@@ -68,7 +68,7 @@ def profile(
 
 @inlined
 def _contract(M: Array, direction: Array, out: Array) -> None:
-    """The 4x4 block of M over position and roll about `direction`."""
+    """Fill `out` with the 4x4 block of M over position and rotation about `direction`."""
     for i in range(3):
         for j in range(3):
             out[i, j] = M[i, j]
@@ -85,7 +85,11 @@ def _contract(M: Array, direction: Array, out: Array) -> None:
 
 @inlined
 def normal_spread(R: Array, t: Array, C: Array, normal: Array) -> tuple[float, float]:
-    """Area sqrt(det) of the normal's covariance (sr), and the squared number of sigmas to the line of sight."""
+    """Return the uncertainty of the normal and its distance from the line of sight.
+
+    The first is the area sqrt(det) of the covariance of the normal (sr), the second the squared number of standard
+    deviations by which the normal is tilted from the line of sight.
+    """
     n = times3(R, normal)
     k = unit3(t)
     a = cross3(n, k)
@@ -106,9 +110,10 @@ def normal_spread(R: Array, t: Array, C: Array, normal: Array) -> tuple[float, f
 
 @inlined
 def opposite(normal_camera: Array, best: Array, far: float) -> bool:
-    """Whether this normal is nearer to the mirror of the best one than to itself, and more than `far` (cosine) off it.
+    """Return whether a normal is nearer to the mirror of the best one than to the best one itself.
 
-    Both face the camera (n . k > 0), in axes whose third is the line of sight k. The mirror of n is 2 (n.k) k - n.
+    It must also be distinct from the best one: `far` is the cosine of the least angle. Both face the camera (n . k >
+    0), in axes of which the third is the line of sight k. The mirror of n is 2 (n.k) k - n.
     """
     lateral = normal_camera[0] * best[0] + normal_camera[1] * best[1]
     return bool(lateral < 1e-9 and lateral + normal_camera[2] * best[2] < far)
@@ -116,7 +121,7 @@ def opposite(normal_camera: Array, best: Array, far: float) -> bool:
 
 @inlined
 def sight_frame(t: Array) -> Array:
-    """Rows: two axes across the line of sight to t, then the line of sight."""
+    """Return an orthonormal frame as rows: two axes perpendicular to the line of sight to t, then the line of sight."""
     k = unit3(t)
     a = np.empty(3)
     if abs(k[1]) < 0.9:  # k x (0, 1, 0), or k x (1, 0, 0)
@@ -135,13 +140,13 @@ def sight_frame(t: Array) -> Array:
 def ring_mass(
     R: Array, t: Array, cost: float, X: Array, m: Array, A: Array, normal: Array
 ) -> tuple[float, float, Array, Array, float]:
-    """Posterior mass of the normals on this and on the other side of the line of sight, and the middle pose there.
+    """Sum the posterior mass of the normals on this and on the other side of the line of sight.
 
-    The posterior over the normal is exp(-chi2 / 2) det(information of position and roll)^(-1/2); beforehand all
-    directions in space are equally likely. It is summed over rings of tilt about the line of sight to the centroid.
+    The posterior density of the normal is exp(-chi2 / 2) det(information of position and roll)^(-1/2), with the same
+    prior for all directions in space. It is summed over rings of tilt about the line of sight to the centroid.
 
-    Returns: mass here, mass there (sr, in units of the density at the best pose), R, t, chi-square in the middle of
-    the mass there.
+    Returns: mass on this side and on the other side (sr, relative to the density at the best pose), and R, t,
+    chi-square of the pose in the middle of the mass on the other side.
     """
     F = sight_frame(t)
     best = times3(F, times3(R, normal))

@@ -1,4 +1,4 @@
-"""Compiled whole of the four-light pose: minima with covariance, and how much of the posterior each of them holds."""
+"""Pose of four points in compiled code: all minima with covariance, and the posterior mass of each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from perception.vision.quadrangle.minima import all_minima
 from perception.vision.quadrangle.posterior import MIRROR_TURN_COS, normal_spread, opposite, ring_mass, sight_frame
 from perception.vision.quadrangle.small_vectors import mix3, put1, put2, times3
 
-WORTHLESS = 60.0  # chi-square above the best at which a minimum has odds of 1 in 1e13
+WORTHLESS = 60.0  # a minimum with a chi-square so far above the best has odds of 1 in 1e13
 
 
 @compiled
@@ -27,12 +27,18 @@ def solve(
     Cs: Array,
     masses: Array,
 ) -> tuple[int, int, int]:
-    """Everything about one view: minima with covariance and posterior mass, lowest chi-square first.
+    """Compute everything about one view: minima with covariance and posterior mass, lowest chi-square first.
 
     Args:
-        near_sigmas2: the rings are summed when the line of sight is nearer to the best normal (sigmas squared).
-        Rs (M, 3, 3), ts (M, 3), costs (M,), Cs (M, 6, 6), masses (M,): filled. Poses are of the object's own origin.
-            When the other side of the line of sight has mass but no minimum, its middle is appended, covariance 0.
+        points, pixels, covariance: (4, 3) in m, (4, 2) and (4, 2, 2) in px.
+        camera: (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3.
+        near_sigmas2: the posterior is summed over rings (`ring_mass`) if the squared distance of the best normal from
+        the
+            line of sight, in standard deviations, is smaller.
+        Rs (M, 3, 3), ts (M, 3), costs (M,), Cs (M, 6, 6), masses (M,): outputs. Poses are those of the object's own
+        origin.
+            If the other side of the line of sight has mass but no minimum, the middle of that mass is appended as a
+            pose with covariance 0.
 
     Returns: number of poses, number of them that are minima, error code (0 fine, others in `pose`).
     """
@@ -48,7 +54,7 @@ def solve(
     count = all_minima(X, m, A, normal, Rs[:-1], ts[:-1], costs[:-1], Ns[:-1])
     if count == 0:
         return 0, 0, 3
-    while costs[count - 1] - costs[0] > WORTHLESS:  # among them runs that fled to infinity, where everything is flat
+    while costs[count - 1] - costs[0] > WORTHLESS:  # such as runs that diverged to infinity, where the cost is flat
         count -= 1
     if not weigh(Ns, costs, Cs, masses, count):
         return 0, 0, 4
@@ -74,7 +80,7 @@ def solve(
 
 @inlined
 def centred(points: Array, X: Array) -> tuple[Array, float]:
-    """Fills X (4, 3) with the points about their centroid; returns the centroid and the sum of squared distances."""
+    """Fill X (4, 3) with the points relative to their centroid; returns centroid and sum of squared distances."""
     c = np.zeros(3)
     for i in range(4):
         for j in range(3):
@@ -89,9 +95,9 @@ def centred(points: Array, X: Array) -> tuple[Array, float]:
 
 @inlined
 def weigh(Ns: Array, costs: Array, Cs: Array, masses: Array, count: int) -> bool:
-    """Fills covariances Cs and Laplace's masses over all six parameters, the best minimum's being 1.
+    """Fill the covariances Cs and the posterior masses by Laplace's approximation, relative to the best minimum.
 
-    Returns: whether every Ns is positive definite.
+    Ns: (M, 6, 6) Gauss-Newton matrices. Returns whether every one is positive definite.
     """
     for k in range(count):
         if not inverse6(Ns[k], Cs[k]):
@@ -104,7 +110,7 @@ def weigh(Ns: Array, costs: Array, Cs: Array, masses: Array, count: int) -> bool
 
 @inlined
 def share(ratio: float, Rs: Array, t: Array, normal: Array, masses: Array, count: int) -> bool:
-    """Gives the minima on the other side of the line of sight to t the mass `ratio` together, where that is more.
+    """Scale the masses of the minima on the other side of the line of sight so that their sum is at least `ratio`.
 
     Returns: whether there is such a minimum with mass.
     """

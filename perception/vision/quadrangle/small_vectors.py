@@ -1,6 +1,6 @@
-"""Arithmetic of three-vectors and 3x3 matrices that the loops of the four-light pose share.
+"""Arithmetic of three-vectors and 3x3 matrices for the compiled loops of the pose of four points.
 
-Array expressions, `np.cross` and `@` would read better, but each costs up to a second of compile time where it stands.
+Array expressions, `np.cross` and `@` would be easier to read, but each use takes up to a second to compile.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from hal.jit import inlined
 
 @inlined
 def product3(A: Array, B: Array) -> Array:
-    """A @ B, 3x3."""
+    """Return A @ B, both 3x3."""
     C = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -23,7 +23,7 @@ def product3(A: Array, B: Array) -> Array:
 
 @inlined
 def times3(M: Array, v: Array) -> Array:
-    """M @ v, 3x3 and (3,)."""
+    """Return M @ v for a 3x3 matrix and a vector (3,)."""
     x = np.empty(3)
     for i in range(3):
         x[i] = M[i, 0] * v[0] + M[i, 1] * v[1] + M[i, 2] * v[2]
@@ -32,7 +32,7 @@ def times3(M: Array, v: Array) -> Array:
 
 @inlined
 def back3(M: Array, v: Array, factor: float) -> Array:
-    """factor * M^T @ v, 3x3 and (3,)."""
+    """Return factor * M^T @ v for a 3x3 matrix and a vector (3,)."""
     x = np.empty(3)
     for i in range(3):
         x[i] = factor * (M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2])
@@ -41,13 +41,13 @@ def back3(M: Array, v: Array, factor: float) -> Array:
 
 @inlined
 def dot3(a: Array, b: Array) -> float:
-    """a . b, (3,) each."""
+    """Return a . b of two vectors (3,)."""
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @inlined
 def cross3(a: Array, b: Array) -> Array:
-    """a x b, (3,) each."""
+    """Return a x b of two vectors (3,)."""
     x = np.empty(3)
     x[0] = a[1] * b[2] - a[2] * b[1]
     x[1] = a[2] * b[0] - a[0] * b[2]
@@ -57,7 +57,7 @@ def cross3(a: Array, b: Array) -> Array:
 
 @inlined
 def mix3(p: float, a: Array, q: float, b: Array) -> Array:
-    """p a + q b for numbers p, q and (3,) a, b."""
+    """Return p a + q b for numbers p, q and vectors a, b (3,)."""
     x = np.empty(3)
     for i in range(3):
         x[i] = p * a[i] + q * b[i]
@@ -66,7 +66,7 @@ def mix3(p: float, a: Array, q: float, b: Array) -> Array:
 
 @inlined
 def unit3(a: Array) -> Array:
-    """a / |a|, (3,)."""
+    """Return a / |a| of a vector (3,)."""
     norm = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     x = np.empty(3)
     for i in range(3):
@@ -76,14 +76,14 @@ def unit3(a: Array) -> Array:
 
 @inlined
 def put1(into: Array, values: Array) -> None:
-    """Copy a vector."""
+    """Copy a vector into another."""
     for i in range(values.shape[0]):
         into[i] = values[i]
 
 
 @inlined
 def put2(into: Array, values: Array) -> None:
-    """Copy a matrix."""
+    """Copy a matrix into another."""
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             into[i, j] = values[i, j]

@@ -1,6 +1,6 @@
-"""Compiled three-point poses: the first half of the paper's direct route (Section II-B), and seeds for the refinement.
+"""Compiled poses of three points: the first half of the paper's direct route (Section II-B), and refinement starts.
 
-The code reads from `real_cubic_root` down to `three_point`; conventions as in `cost`.
+`three_point`, at the end, uses the functions above it. Conventions are those of `cost`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, produ
 
 @inlined
 def real_cubic_root(b: float, c: float, d: float) -> float:
-    """The largest real root of x^3 + b x^2 + c x + d (Viete and Cardano, then two Newton steps)."""
+    """Return the largest real root of x^3 + b x^2 + c x + d (Viete and Cardano, then two Newton steps)."""
     p = c - b * b / 3.0
     q = 2.0 * b * b * b / 27.0 - b * c / 3.0 + d
     disc = q * q / 4.0 + p * p * p / 27.0
@@ -31,14 +31,14 @@ def real_cubic_root(b: float, c: float, d: float) -> float:
     for _ in range(2):
         slope = (3.0 * x + 2.0 * b) * x + c
         value = ((x + b) * x + c) * x + d
-        if abs(value) < 1e-3 * (1.0 + abs(x)) * abs(slope):  # never far: near a double root the slope means nothing
+        if abs(value) < 1e-3 * (1.0 + abs(x)) * abs(slope):  # small steps only: the slope vanishes at a double root
             x -= value / slope
     return x
 
 
 @inlined
 def cofactors(M: Array) -> Array:
-    """Adjugate of a symmetric 3x3 matrix."""
+    """Return the adjugate of a symmetric 3x3 matrix."""
     B = np.empty((3, 3))
     B[0, 0] = M[1, 1] * M[2, 2] - M[1, 2] * M[1, 2]
     B[1, 1] = M[0, 0] * M[2, 2] - M[0, 2] * M[0, 2]
@@ -51,7 +51,7 @@ def cofactors(M: Array) -> Array:
 
 @inlined
 def triad(p0: Array, p1: Array, p2: Array) -> Array:
-    """Orthonormal frame (columns) of three points: along p1 - p0, in their plane, normal to it."""
+    """Return the orthonormal frame (columns) of three points: along p1 - p0, in their plane, normal to it."""
     a = unit3(mix3(1.0, p1, -1.0, p0))
     n = unit3(cross3(a, mix3(1.0, p2, -1.0, p0)))
     b = cross3(n, a)
@@ -63,7 +63,7 @@ def triad(p0: Array, p1: Array, p2: Array) -> Array:
 
 @inlined
 def refine_depths(s: Array, d2: Array, cosines: Array) -> None:
-    """Newton on the three law-of-cosines equations; leaves s where it does not help."""
+    """Refine the depths s (3,) by Newton steps on the three law-of-cosines equations; stops where they are singular."""
     for _ in range(3):
         e0 = s[1] * s[1] + s[2] * s[2] - 2.0 * s[1] * s[2] * cosines[0] - d2[0]
         e1 = s[0] * s[0] + s[2] * s[2] - 2.0 * s[0] * s[2] * cosines[1] - d2[1]
@@ -89,7 +89,10 @@ def refine_depths(s: Array, d2: Array, cosines: Array) -> None:
 
 @inlined
 def laws_of_cosines(P: Array, f: Array, d2: Array, cosines: Array) -> None:
-    """Squared sides d2 and cosines between rays (3 each, opposite corner k) of points P (3, 3) and unit rays f (3, 3)."""
+    """Fill the squared sides d2 (3,) of the points P (3, 3) and the cosines (3,) between the unit rays f (3, 3).
+
+    Entry k belongs to the side opposite to point k.
+    """
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         side = mix3(1.0, P[i], -1.0, P[j])
@@ -99,7 +102,10 @@ def laws_of_cosines(P: Array, f: Array, d2: Array, cosines: Array) -> None:
 
 @inlined
 def conics(d2: Array, cosines: Array) -> tuple[Array, Array]:
-    """D1 = d2[1] M0 - d2[0] M1 and D2 = d2[2] M0 - d2[0] M2 over d2[0], with M_k the form of law k: s^T D s = 0."""
+    """Return two conics in the depths s, s^T D s = 0, in which the constant terms of the laws of cosines cancel.
+
+    D1 = d2[1] M0 - d2[0] M1 and D2 = d2[2] M0 - d2[0] M2, both divided by d2[0], with M_k the quadratic form of law k.
+    """
     r1, r2 = d2[1] / d2[0], d2[2] / d2[0]
     D1, D2 = np.zeros((3, 3)), np.zeros((3, 3))
     D1[0, 0], D1[1, 1], D1[2, 2] = -1.0, r1, r1 - 1.0
@@ -113,7 +119,7 @@ def conics(d2: Array, cosines: Array) -> tuple[Array, Array]:
 
 @inlined
 def line_pair(D1: Array, D2: Array, lines: Array) -> bool:
-    """Fill `lines` (2, 3) with the two lines of a degenerate conic of the pencil w1 D1 + w2 D2; False when there is none."""
+    """Fill `lines` (2, 3) with the two lines of a degenerate conic w1 D1 + w2 D2; returns False if there is none."""
     C1, C2 = cofactors(D1), cofactors(D2)
     c3 = c2 = c1 = c0 = 0.0
     for i in range(3):
@@ -122,7 +128,7 @@ def line_pair(D1: Array, D2: Array, lines: Array) -> bool:
         for j in range(3):
             c2 += D1[i, j] * C2[i, j]
             c1 += D2[i, j] * C1[i, j]
-    # det(D1 + g D2) = c3 g^3 + c2 g^2 + c1 g + c0; solved for 1/g when that is better conditioned.
+    # det(D1 + g D2) = c3 g^3 + c2 g^2 + c1 g + c0; solved for 1/g if that is better conditioned.
     if abs(c3) >= abs(c0):
         if c3 == 0.0:
             return False
@@ -135,7 +141,10 @@ def line_pair(D1: Array, D2: Array, lines: Array) -> bool:
 
 @inlined
 def split(D: Array, lines: Array) -> None:
-    """The lines l, m of D = l m^T + m l^T: -adj(D) = p p^T with p their crossing, and D + [p]x has rank one."""
+    """Fill `lines` (2, 3) with the lines l, m of a degenerate conic D = l m^T + m l^T.
+
+    -adj(D) = p p^T, with p their intersection, and D + [p]x has rank one.
+    """
     B = cofactors(D)
     k = 0
     for i in range(1, 3):
@@ -164,7 +173,10 @@ def split(D: Array, lines: Array) -> None:
 
 @inlined
 def crossings(line: Array, D1: Array, S: Array) -> int:
-    """Fill S (2, 3) with the ratios of depths where a line meets the conic D1; how many: 2, or 0 for no line."""
+    """Fill S (2, 3) with the ratios of depths at which a line meets the conic D1; returns their number.
+
+    That is 2, or 0 if the line is zero.
+    """
     k = 0
     for i in range(1, 3):
         if abs(line[i]) > abs(line[k]):
@@ -188,7 +200,10 @@ def crossings(line: Array, D1: Array, S: Array) -> int:
 
 @inlined
 def sized(s: Array, d2: Array, cosines: Array) -> bool:
-    """Bring depths s, known up to a factor, to the sides' size and refine them; False where one is not in front."""
+    """Scale depths s (3,), known up to a factor, to the size of the sides and refine them.
+
+    Returns False if a point is not in front of the camera.
+    """
     sign = -1.0 if s[0] + s[1] + s[2] < 0.0 else 1.0
     for n in range(3):
         s[n] *= sign
@@ -213,7 +228,10 @@ def sized(s: Array, d2: Array, cosines: Array) -> bool:
 
 @inlined
 def carried(P: Array, f: Array, s: Array, R: Array, t: Array) -> bool:
-    """Fill R, t: the pose that carries points P (3, 3) to depths s (3,) along the rays f; False when it is no pose."""
+    """Fill R, t with the pose that moves the points P (3, 3) to depths s (3,) along the rays f.
+
+    Returns False if that is not defined.
+    """
     Q = np.empty((3, 3))
     for n in range(3):
         for a in range(3):
@@ -231,11 +249,12 @@ def carried(P: Array, f: Array, s: Array, R: Array, t: Array) -> bool:
 
 @compiled
 def three_point(P: Array, f: Array, Rs: Array, ts: Array) -> int:
-    """Poses that carry three points (3, 3) onto three unit rays (3, 3); fills Rs, ts (4 of them), returns how many.
+    """Compute the poses that move three points (3, 3) onto three unit rays (3, 3); fills Rs, ts, returns their number.
 
-    The depths s solve three law-of-cosines equations. Two combinations without constant term are conics in s; the
-    pencil of both holds a pair of lines (a cubic), each of which meets a conic twice. Where noise makes a crossing
-    complex its real part is kept: close to a double root the truth is there.
+    At most 4 are found. The depths s solve three law-of-cosines equations. Two combinations without a constant term are
+    conics in s; the pencil of both contains a pair of lines (the root of a cubic), each of which meets a conic twice.
+    Where noise makes an intersection complex its real part is kept, because the true pose is then near a double root.
+
     Source: Grunert 1841; the pencil of conics as in Finsterwalder, see Haralick et al., IJCV 13(3), 1994, Section 2.
     """
     d2, cosines = np.empty(3), np.empty(3)

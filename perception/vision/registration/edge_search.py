@@ -1,4 +1,4 @@
-"""The strongest edge along a normal: the inner loop of `register`, compiled."""
+"""Search for the strongest edge along a normal: the compiled inner loop of `register`."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from hal.arrays import Array
 from hal.jit import compiled
 from perception.vision.bilinear import value_at
 
-STEP_PX = 0.5
+STEP_PX = 0.5  # distance between samples along a normal
 
 
 @compiled
 def strongest_edges(
     smooth: NDArray[np.float32], points_px: Array, normals_px: Array, window_px: float
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Where the slope along every normal is steepest, a gaussian of `window_px` preferring what is near.
+    """Find where the slope along every normal is steepest, with a Gaussian preference for small offsets.
 
     Args:
         smooth: (H, W) gray.
-        points_px, normals_px: (N, 2) places (u, v) and unit directions.
+        points_px, normals_px: (N, 2) points (u, v) and unit directions.
+        window_px: half length of the search, and standard deviation of the preference.
 
     Returns:
-        (N,) signed offset in px, refined by a parabola through three slopes; (N,) the slope there, gray levels a px; and (N,)
-        whether the whole normal lies inside the image (offset and slope are 0 where it does not).
+        (N,) signed offset in px, refined by a parabola through three slopes; (N,) the slope there, gray levels per px;
+        and (N,) whether the whole normal lies inside the image (offset and slope are 0 where it does not).
     """
     height, width = smooth.shape
     half = int(window_px / STEP_PX)
@@ -37,7 +38,7 @@ def strongest_edges(
         u, v = points_px[i]
         along_u, along_v = normals_px[i]
         over_u, over_v = abs(along_u) * reach, abs(along_v) * reach
-        # A place that is not finite is not inside either.
+        # A point that is not finite fails this test, too.
         visible[i] = u - over_u >= 1 and v - over_v >= 1 and u + over_u < width - 2 and v + over_v < height - 2
         if not visible[i]:
             continue

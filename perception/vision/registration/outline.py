@@ -1,4 +1,4 @@
-"""Edges that every kind of object shows in any state: contour points of the panel file in the panel frame."""
+"""Edges that an object shows in every state: contour points of the panel file's objects in the panel frame."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ PLATE_POINTS = 40
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outline:
-    """Contour samples: `points_m` (N, 3) in the panel frame, `normals` (N, 2) unit, outward on the plate.
+    """Samples of a contour: `points_m` (N, 3) in the panel frame, `normals` (N, 2) unit, outward on the plate.
 
-    `reach_m`: how far inside or outside of the contour a parallel edge of the same object may be the stronger one.
+    `reach_m`: how far inside or outside of the contour a parallel edge of the same object may be stronger.
     """
 
     points_m: Array
@@ -27,7 +27,7 @@ class Outline:
 
 
 def edges_of(panel_object: PanelObject) -> Outline | None:
-    """The edges that every state shows; None for kinds whose fixed parts the panel file leaves open."""
+    """Return the edges that every state shows; None for kinds whose fixed parts the panel file does not describe."""
     rim = panel_object.rim
     if rim is None:
         return None
@@ -41,12 +41,12 @@ def edges_of(panel_object: PanelObject) -> Outline | None:
 
 
 def plate_edges(panel: Panel) -> Outline:
-    """The border of the plate's front face."""
+    """Return the border of the plate's front face."""
     return rectangle(0.0, 0.0, 0.0, width_m=panel.width_m, height_m=panel.height_m, count=PLATE_POINTS)
 
 
 def box_m(panel_object: PanelObject) -> Array:
-    """(4, 3) corners of the object's footprint, upper left first and clockwise as the viewer sees it."""
+    """Return the corners (4, 3) of the object's footprint, upper left first and clockwise as the viewer sees it."""
     face = panel_object.face
     w, h, z = face.half_width_m, face.half_height_m, face.height_m
     x, y = panel_object.position_m
@@ -54,7 +54,7 @@ def box_m(panel_object: PanelObject) -> Array:
 
 
 def contour_m(panel_object: PanelObject) -> Array:
-    """(N, 3) closed contour for drawing: a circle for round kinds, else the footprint."""
+    """Return a closed contour (N, 3) for drawing: a circle for round kinds, else the footprint."""
     edges = edges_of(panel_object)
     if edges is not None:
         return edges.points_m
@@ -64,7 +64,7 @@ def contour_m(panel_object: PanelObject) -> Array:
 
 
 def rectangle(x: float, y: float, z: float, *, width_m: float, height_m: float, count: int) -> Outline:
-    """The four sides of a rectangle, `count` points a side, corners left out."""
+    """Return the four sides of a rectangle with `count` points per side, without the corners."""
     s = (np.arange(count) + 0.5) / count - 0.5
     w, h, half, one, zero = s * width_m, s * height_m, 0.5, np.ones(count), np.zeros(count)
     px = np.concatenate([w, one * half * width_m, -w, -one * half * width_m])
@@ -74,6 +74,7 @@ def rectangle(x: float, y: float, z: float, *, width_m: float, height_m: float, 
 
 
 def _circle(x: float, y: float, z: float, radius_m: float) -> Outline:
+    """Return a circle about (x, y) at height z."""
     a = 2 * np.pi * np.arange(CIRCLE_POINTS) / CIRCLE_POINTS
     normals = np.column_stack([np.sin(a), np.cos(a)])
     points = np.column_stack([x + radius_m * normals[:, 0], y + radius_m * normals[:, 1], np.full(CIRCLE_POINTS, z)])

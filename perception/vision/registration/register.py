@@ -21,17 +21,18 @@ from perception.vision.projection import PanelProjection
 from perception.vision.registration.edge_search import strongest_edges
 from perception.vision.registration.outline import Outline, edges_of, plate_edges
 
-WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # search to either side; the pose is known to a few pixels
-LAST_LOOK_PX, NEAR_PX = 2.5, 2.0  # search at the end, and how near an edge confirms the model
+WINDOWS_PX = (8.0, 5.0, 3.0, 2.0)  # half lengths of the search; the predicted pose is good to a few pixels
+# Half length of the last search, and largest offset of an edge that confirms the model.
+LAST_LOOK_PX, NEAR_PX = 2.5, 2.0
 SMOOTHING_SIGMA_PX = 0.8
-SLOPE_NOISE = 0.35  # of the central difference after that smoothing, over the image's noise
-EDGE_TO_NOISE = 4.0  # an edge counts when its slope exceeds that many sigmas of the slope's noise
-NORMAL_STEP_M = 1e-3
-MEASUREMENT_SIGMA_PX = 0.5
-GROWTH_SIGMA_PX = 2.0
-EDGE_BIAS_SIGMA_PX = 0.8  # a drawn or real cast shadow moves a whole outline by about 1 px
-REGISTERED_SIGMA_PX = 0.15  # of the panel as a whole
-MIN_VISIBLE = 16  # fewer edge samples in the image say nothing about the panel
+SLOPE_NOISE = 0.35  # noise of the central difference after that smoothing, relative to the image's noise
+EDGE_TO_NOISE = 4.0  # least slope of an edge, relative to the slope's noise
+NORMAL_STEP_M = 1e-3  # step on the plate that gives the direction of a normal in the image
+MEASUREMENT_SIGMA_PX = 0.5  # least scale of the residuals in the robust weights
+GROWTH_SIGMA_PX = 2.0  # prior standard deviation of an object's growth
+EDGE_BIAS_SIGMA_PX = 0.8  # a printed or real cast shadow shifts a whole outline by about 1 px
+REGISTERED_SIGMA_PX = 0.15  # standard deviation of the panel's registration as a whole
+MIN_VISIBLE = 16  # with fewer edge samples in the image nothing can be said about the panel
 
 
 V = TypeVar("V", bound=PanelProjection)
@@ -39,15 +40,15 @@ V = TypeVar("V", bound=PanelProjection)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:
-    """The view after registration and how well the model's edges were found.
+    """Result of a registration: the view, and how well the model's edges were found.
 
     Attributes:
-        view: the moved view.
-        covariance: of the motion parameters, after registration.
-        support: share of the visible model edges with an image edge within 2 px; NaN when too few are in view.
-        rms_px: of the supporting edges.
-        shift_px: per object name, the (2,) local shift on top of the view; zero where it could not be measured.
-        shift_sigma_px: per object name, one sigma of that shift's coordinates.
+        view: the registered view.
+        covariance: of its motion parameters.
+        support: share of the visible model edges with an image edge within 2 px; NaN if too few are in view.
+        rms_px: root mean square offset of these edges.
+        shift_px: per object name, the (2,) local shift in addition to the view; zero if it could not be measured.
+        shift_sigma_px: per object name, the standard deviation of each coordinate of that shift.
         edge_share: per object name, the share of its own edges found; NaN for kinds without fixed edges.
     """
 
@@ -61,10 +62,10 @@ class Registration:
 
 
 def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
-    """Move `view` so that the panel's edges lie on the image's.
+    """Move `view` so that the projected edges of the panel coincide with edges in the image.
 
     Args:
-        gray: (H, W) uint8, as the camera saw it (distorted).
+        gray: (H, W) uint8, as the camera recorded it (with distortion).
         view: prediction, good to a few pixels.
     """
     image = edge_image(gray)
@@ -97,36 +98,47 @@ def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EdgeImage:
-    """An image as edges are looked for in it: `smooth` (H, W) gray, and one sigma of a slope's noise."""
+    """An image prepared for the edge search: `smooth` (H, W) gray, and the standard deviation of a slope's noise."""
 
     smooth: NDArray[np.float32]
     slope_noise: float
 
 
 def edge_image(gray: Image) -> EdgeImage:
-    """Made once an image; `follow_edges` and `confirmed` may then be called often."""
+    """Prepare an image for the edge search; needed once per image for any number of `follow_edges` and `confirmed`."""
     smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
     slope_noise = SLOPE_NOISE * noise_sigma(gray)
     return EdgeImage(smooth=smooth, slope_noise=slope_noise)
 
 
 def follow_edges(image: EdgeImage, view: V, outline: Outline, windows_px: Sequence[float]) -> V:
-    """`view` moved so that one outline lies on the image's edges; the view itself when too few are found."""
+    """Return `view` moved so that one outline coincides with edges in the image; unchanged if too few edges are found.
+
+    windows_px: half lengths of the search, one after the other.
+    """
     delta = np.zeros(len(view.prior_sigma))
-    motion = _motion(view, delta, outline.points_m)  # of a plane: hardly changes within a dozen pixels
+    motion = _motion(view, delta, outline.points_m)  # nearly constant within a dozen pixels
     for window in windows_px:
         delta, _ = _step(image.smooth, image.slope_noise, view, delta, edges=outline, window_px=window, motion=motion)
     return view.moved(delta)
 
 
 def confirmed(image: EdgeImage, view: PanelProjection, outline: Outline) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(N,) which samples of the outline the image shows, and which of them have an edge within `NEAR_PX`."""
+    """Return which samples of the outline (N,) are inside the image, and which have an edge within `NEAR_PX`."""
     found = _look(image.smooth, image.slope_noise, view, outline, LAST_LOOK_PX)
     return found.visible, found.ok & (np.abs(found.offset_px) <= NEAR_PX)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:
+    """Edges found along the normals of an outline.
+
+    Attributes:
+        offset_px: (N,) signed offsets along the normals.
+        normals_px: (N, 2) unit normals in the image.
+        visible, ok: (N,) whether the search lies inside the image, and whether it found an edge.
+    """
+
     offset_px: Array
     normals_px: Array
     visible: NDArray[np.bool_]
@@ -136,7 +148,7 @@ class _Found:
 def _look(
     smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, window_px: float
 ) -> _Found:
-    """The strongest image edge along every model normal: signed offset in px."""
+    """Find the strongest image edge along every normal of the model."""
     points = view.project(edges.points_m)
     ahead = view.project(
         edges.points_m + NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
@@ -150,7 +162,7 @@ def _look(
 
 
 def _ahead(view: PanelProjection, edges: Outline) -> Array:
-    """(N, 2) displacement in the image, px, for a step along every normal."""
+    """Return the displacement in the image (N, 2), px, for a step of `NORMAL_STEP_M` along every normal."""
     step = NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
     return view.project(edges.points_m + step) - view.project(edges.points_m)
 
@@ -159,7 +171,10 @@ def _step(
     smooth: NDArray[np.float32], slope_noise: float, reference: PanelProjection, delta: Array, *, edges: Outline, window_px: float,
     motion: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Two Gauss-Newton steps on the edges found in one window; `motion` (N, 2, P) is what `_motion` gives."""
+    """Do two Gauss-Newton steps on the edges found in one window; returns the motion parameters and their covariance.
+
+    `motion` (N, 2, P) is the result of `_motion`.
+    """
     sigma = reference.prior_sigma
     information = np.diag(1.0 / sigma**2)
     for _ in range(2):
@@ -178,7 +193,7 @@ def _step(
 
 
 def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
-    """(N, 2, P) derivatives of the projected points with respect to every motion parameter, by differences."""
+    """Return the derivatives (N, 2, P) of the projected points over the motion parameters, by finite differences."""
     base = reference.moved(delta).project(points_m)
     out = np.empty((len(points_m), 2, len(delta)))
     for k, sigma in enumerate(reference.prior_sigma):
@@ -191,10 +206,10 @@ def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
 def _local_shift(
     smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, built_m: float
 ) -> tuple[Array, float, float]:
-    """An object's own (2,) shift in px, its sigma, and the share of its edges found near the model.
+    """Return an object's own shift (2,) in px, its standard deviation, and the share of its edges found near the model.
 
-    `built_m` is one sigma of the object's place on the plate. The object's own edges carry a common error that more of
-    them do not average out: a cast shadow or a side wall moves all edges of one side.
+    `built_m` is the standard deviation of the object's position on the plate. The edges of an object have a common
+    error that does not average out, because a cast shadow or a side wall moves all edges of one side.
     """
     scale_px_per_m = float(np.nanmedian(np.linalg.norm(_ahead(view, edges), axis=1))) / NORMAL_STEP_M
     reach_px = edges.reach_m * scale_px_per_m
@@ -204,7 +219,7 @@ def _local_shift(
     if found.ok.sum() < 6:
         return np.zeros(2), prior_px, 0.0 if visible >= 6 else float("nan")
     r = found.offset_px[found.ok]
-    # The third unknown is growth: a bezel or a printed ring may be the stronger edge, all around the object.
+    # The third unknown is growth: all around the object a bezel or a printed ring may be the stronger edge.
     J = np.column_stack([found.normals_px[found.ok], np.ones(len(r))])
     prior = np.diag([1e-6, 1e-6, 1 / (GROWTH_SIGMA_PX + reach_px) ** 2])
     solution, N = np.array([0.0, 0.0, float(np.median(r))]), prior
@@ -221,4 +236,5 @@ def _local_shift(
 
 
 def _joined(outlines: list[Outline]) -> Outline:
+    """Return several outlines as one."""
     return Outline(points_m=np.vstack([o.points_m for o in outlines]), normals=np.vstack([o.normals for o in outlines]))

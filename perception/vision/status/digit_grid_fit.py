@@ -105,7 +105,10 @@ def refine_grid(
 
 @inlined
 def is_sound(grid: Array, count: int, rows: int, columns: int, lean: float) -> bool:
-    """Whether the cells do not overlap (neighbours would share an upright), stay in the picture and are shaped like digits."""
+    """Return whether the cells of a grid are shaped like digits, stay in the picture and do not overlap.
+
+    Overlapping neighbours would share an upright stroke.
+    """
     left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     right = left + (count - 1) * pitch + width

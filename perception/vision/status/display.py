@@ -174,7 +174,7 @@ def _decoded(
 
 
 def _same(a: DigitGrid, b: DigitGrid) -> bool:
-    """Whether two grids lie on the same digits, so that only one of them needs to be read."""
+    """Return whether two grids lie on the same digits, so that only one of them needs to be read."""
     off = np.abs(a.numbers - b.numbers)  # left, pitch, width, top, bottom
     return a.count == b.count and bool(off[:5].max() < SAME_COMB * a.height_px)
 

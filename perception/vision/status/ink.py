@@ -51,7 +51,7 @@ def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = N
 
 
 def _is_uneven(background: Image, lost: NDArray[np.bool_]) -> bool:
-    """Whether the background varies so much that only glare explains it."""
+    """Return whether the background varies so much that only glare explains it."""
     shown = background[::3, ::3][~lost[::3, ::3]].astype(np.float32)
     return shown.size > 0 and level_at(shown, 0.95) - level_at(shown, 0.05) > GLARE
 

@@ -63,7 +63,7 @@ def with_hidden_ends(seen: Float32, grid: DigitGrid, most: int) -> DigitGrid:
 
 
 def _fits(cell: DigitGrid, columns: int) -> bool:
-    """Whether a further cell lies inside the picture with its strokes."""
+    """Return whether a further cell lies inside the picture with its strokes."""
     u, _ = cell.place(np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0]), np.zeros(4))
     half = STROKE * cell.height_px
     return bool(u.min() >= half and u.max() <= columns - 1 - half)

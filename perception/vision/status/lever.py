@@ -107,7 +107,7 @@ def _that_ends(
 
 
 def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
-    """Whether the visible line is parallel to the state's direction and beside it, rather than a bar turned off it.
+    """Return whether the visible line is parallel to the state's direction and beside it, and no bar at an angle to it.
 
     A handle as gray as the plate shows only by the shadow along its side; a handle between two states is not parallel.
     """

@@ -156,7 +156,7 @@ def cables_across(patch: Patch, *, radius_m: float, own_rad: Array) -> NDArray[n
 
 
 def _is_own(band: _Band, middle_px: Array, own_rad: Array) -> bool:
-    """Whether a band may be a part of the object: through its middle, in one of its own directions."""
+    """Return whether a band may be a part of the object: through its middle, in one of its own directions."""
     first, last = band.points_px[0], band.points_px[-1]
     along = (last - first) / max(float(np.linalg.norm(last - first)), 1e-9)
     to_middle = middle_px - first

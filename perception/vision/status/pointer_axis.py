@@ -57,7 +57,7 @@ def row_centres(
 def _goes_under(
     ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: float, half: float, top: float
 ) -> bool:
-    """Whether the relevant ink of a row is adjacent to hidden samples."""
+    """Return whether the relevant ink of a row is adjacent to hidden samples."""
     columns = len(ink)
     for j in range(columns):
         if abs(offset[j] - middle) < half and ink[j] > HALF_LEVEL * top:

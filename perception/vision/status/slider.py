@@ -212,7 +212,7 @@ def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: flo
 
 
 def _is_cap(profile: Array, beyond: Array, s: Array, open_: Array, width_m: float) -> bool:
-    """Whether the apparent occluder of the track is the cap itself; a dark cap merges with printed ticks of the same gray.
+    """Return whether the apparent occluder of the track is the cap itself, merged with printed ticks of the same gray.
 
     The cap has the length that the panel file states, it is the only thing that stands out there, and it ends on both
     sides.

@@ -54,7 +54,7 @@ def stray_ink(ink: Float32, grid: DigitGrid, lit_levels: Array) -> float:
 
 
 def leaves_out(ink: Float32, grid: DigitGrid, lit_levels: Array) -> bool:
-    """Whether something as high as a digit, or a bar at half height like a sign, stands right beside the grid.
+    """Return whether something as high as a digit, or a bar at half height like a sign, stands right beside the grid.
 
     A frame is higher than the digits, and words beside them are lower.
     """

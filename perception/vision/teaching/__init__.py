@@ -1,4 +1,4 @@
-"""Teaching by clicks and answers: kinds by examples, whole panels by a dialogue, and a known panel by itself."""
+"""Teaching of kinds by examples, of whole panels by clicks and answers, and of looks from a known panel."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Selection of the taught examples worth keeping: those that the examples kept so far would misclassify.
 
-P. E. Hart, the condensed nearest neighbour rule, IEEE Trans. Inf. Theory 14(3), 1968, with a margin.
+Source: P. E. Hart, The condensed nearest neighbour rule, IEEE Trans. Inf. Theory 14(3), 1968, here with a margin.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from perception.vision.finding.match import CLIP, distances
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.look import WEIGHTS
 
-OBJECT_MARGIN, NOTHING_MARGIN = 0.2, 0.03  # by which a look must be nearer to its own kind than to others
-PASSES = 3
+# By which a look must be nearer to its own kind than to others, in units of likeness.
+OBJECT_MARGIN, NOTHING_MARGIN = 0.2, 0.03
+PASSES = 3  # at most, over all looks
 
 
 def worth_keeping(
@@ -26,14 +27,15 @@ def worth_keeping(
     weights: Array | None = None,
     nothing_margin: float = NOTHING_MARGIN,
 ) -> NDArray[np.int64]:
-    """Indices of the looks to keep: those that the others kept, and what is known, do not name with the margin.
+    """Return the indices of the looks to keep: those that known and kept looks do not classify correctly with a margin.
 
     Args:
-        looks: (N, LENGTH), and `names` (N,) of their kinds.
+        looks: (N, LENGTH).
+        names: (N,) of their kinds.
         spread: (LENGTH,) the unit of likeness.
-        known: what was taught before; None for nothing. Of a kind that it does not have, the first look is kept.
-        weights: (LENGTH,) of the numbers of a look; those of what is known if left out.
-        nothing_margin: by which a look of no object must be nearer to such looks than to objects'.
+        known: knowledge from before; None for none. Of a kind that it does not have, the first look is kept.
+        weights: (LENGTH,) of the numbers of a look; those of `known` by default.
+        nothing_margin: margin for looks of the kind `nothing`.
     """
     if weights is None:
         weights = WEIGHTS if known is None else known.weights
@@ -64,7 +66,7 @@ def worth_keeping(
 
 
 def _beforehand(looks: Array, names: NDArray[np.str_], known: Knowledge | None) -> tuple[Array, Array]:
-    """(N,) distances to the nearest known look of the own kind, and of any other; infinite where there is none."""
+    """Return distances (N,) to the nearest known look of the same kind, and of any other; infinite if there is none."""
     own, other = np.full(len(looks), np.inf), np.full(len(looks), np.inf)
     if known is None:
         return own, other

@@ -1,9 +1,9 @@
 """Teaching of looks from a known panel: its file and a view of it determine where every object is, without clicks.
 
-Every object that is present teaches one look, at the sub-object nearest to its middle, where blind recognition will
-search. If none lies at the middle, as for a lever, the look includes the middle's offset from the sub-object: the
-paper's relations. Sub-objects that belong to no object teach the kind `nothing`. Only looks that the others do not
-imply are kept (`condense`).
+Every object that is present teaches one look, at the sub-object nearest to its middle, because blind recognition will
+search there. If no sub-object lies at the middle, as for a lever, the look includes the offset from the sub-object to
+the middle: the paper's relations. Sub-objects that belong to no object teach the kind `nothing`. Only looks that the
+others do not imply are kept (`condense`).
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from perception.vision.registration.register import register
 from perception.vision.teaching.condense import worth_keeping
 from perception.vision.teaching.lesson import NOTHING_SIZE_M, SNAP_M, Overview, overview_of, under_pixels
 
-# A sub-object this near to an object's middle is that object's, whichever of them blind recognition takes.
+# A sub-object this near to an object's middle belongs to the object, whichever of them blind recognition finds.
 PART_M = 0.0067
-FOOT_TO_TOP = np.array([0.0, 0.5, 1.0])  # what stands out of the plate appears between its foot and its top
-LEAST_THERE = 0.5  # of the objects; a panel of which the image has the left half showed 5 of 14
+FOOT_TO_TOP = np.array([0.0, 0.5, 1.0])  # shares of the height; a raised object appears between its foot and its top
+LEAST_THERE = 0.5  # of the objects; in an image of a panel's left half 5 of 14 were present
 NOT_DISTINCT = "nothing there stands out as a whole: come closer, or change the angle or the light"
 
 
@@ -42,8 +42,8 @@ class Shown:
     """An object of the panel in the overview.
 
     Attributes:
-        place_px: (2,) of the rectified plate: the sub-object that taught.
-        middle_m: (2,) from there to the object's middle on the plate; zero where the sub-object lies there.
+        place_px: (2,) position of the sub-object that teaches, on the rectified plate.
+        middle_m: (2,) offset from there to the object's middle on the plate; zero if the sub-object lies at the middle.
         centre_px, box_px: (2,) and (4, 2), the object in the image.
     """
 
@@ -56,15 +56,15 @@ class Shown:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PanelLooks:
-    """What one overview of a known panel taught.
+    """Result of teaching from one overview of a known panel.
 
     Attributes:
         knowledge: with the new looks.
-        added: how many looks every kind that learned something got.
+        added: number of new looks per kind.
         shown: the objects that taught, in the order of the panel file.
-        left_out: why each other object did not teach, by name.
+        left_out: reason why an object did not teach, by name.
         known_before, known_now: names of the objects that blind recognition finds in this overview without and with
-            what was learned. The second says that it was learned, not how well it does on other overviews.
+            the new looks. The second shows that they were learned, not how well they work in other overviews.
     """
 
     knowledge: Knowledge
@@ -76,23 +76,23 @@ class PanelLooks:
 
     @property
     def kinds(self) -> tuple[TaughtKind, ...]:
-        """The kinds that learned something."""
+        """The kinds that got new looks."""
         return tuple(kind for kind in self.knowledge.kinds if kind.name in self.added)
 
 
 def teach_from_panel(
     image: NDArray[Any], view: PanelProjection, panel: Panel, knowledge: Knowledge, *, source: str = ""
 ) -> PanelLooks:
-    """Learn what the objects of a known panel look like in an overview of it.
+    """Learn the looks of the objects of a known panel from an overview of it.
 
     Args:
-        image: overview, gray or RGB uint8, the plate's border in view.
-        view: where the panel is, good to a few pixels.
+        image: overview, gray or RGB uint8, with the plate's border in view.
+        view: projection of the panel, good to a few pixels.
         source: a remark for the files of new kinds.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
-        NotFound, Ambiguous: no plate or two in the image, it does not show this panel there, or none of its objects.
+        NotFound, Ambiguous: the image shows no plate, or two; or not this panel at that pose; or none of its objects.
     """
     gray = as_gray(image)
     focal_px = view.intrinsics.fx_px if isinstance(view, CameraProjection) else None
@@ -113,7 +113,12 @@ def teach_from_panel(
 
 
 def _check_most_are_there(readings: Sequence[ObjectReading], panel: Panel) -> None:
-    """Refuse an image of something else, or one whose border was taken wrongly: chance alone confirms some objects."""
+    """Check that most objects are present.
+
+    Raises:
+        NotFound: they are not. The image then shows something else, or the border was found wrongly; a few objects may
+            appear present by chance.
+    """
     there = sum(reading.present for reading in readings)
     if 0 < there < LEAST_THERE * len(readings):
         raise NotFound(
@@ -125,7 +130,7 @@ def _check_most_are_there(readings: Sequence[ObjectReading], panel: Panel) -> No
 def _objects(
     overview: Overview, view: PanelProjection, panel: Panel, readings: Sequence[ObjectReading], places: Array
 ) -> tuple[tuple[Shown, ...], dict[str, str]]:
-    """The objects that can teach, and why the others cannot."""
+    """Return the objects that can teach, and the reason why each of the others cannot."""
     shown: list[Shown] = []
     left_out: dict[str, str] = {}
     for panel_object, reading in zip(panel.objects, readings, strict=True):
@@ -155,8 +160,10 @@ def _objects(
 def _nearest_sub_object(
     overview: Overview, view: PanelProjection, panel_object: PanelObject, shift_px: Array, places: Array
 ) -> tuple[Array, Array] | None:
-    """The sub-object at the object's middle; else, as for a slider or a lever, the nearest in its box, and how the middle
-    lies from it.
+    """Return the position of the sub-object that teaches, and the offset from it to the object's middle.
+
+    None if there is none. It is the sub-object at the object's middle. If there is none, as for a slider or a lever, it
+    is the nearest one inside the object's box.
     """
     x, y = panel_object.position_m
     stem = np.column_stack([np.tile([x, y], (3, 1)), panel_object.face.height_m * FOOT_TO_TOP])
@@ -175,7 +182,7 @@ def _nearest_sub_object(
 
 
 def _box(overview: Overview, view: PanelProjection, panel_object: PanelObject, shift_px: Array) -> Array:
-    """(2, 2) lowest and highest u and v of the object's box, foot to top, on the rectified plate."""
+    """Return the lowest and highest u and v (2, 2) of the object's box, foot to top, on the rectified plate."""
     face = panel_object.face
     half_width, half_height, height = face.half_width_m, face.half_height_m, face.height_m
     corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (0.0, 1.0)])
@@ -185,14 +192,14 @@ def _box(overview: Overview, view: PanelProjection, panel_object: PanelObject, s
 
 
 def _on_ground(overview: Overview, pixels: Array) -> Array:
-    """(N, 2) pixels of the image as pixels of the rectified plate."""
+    """Convert pixels (N, 2) of the image to pixels of the rectified plate."""
     return overview.on_ground(under_pixels(overview.view, pixels, overview.plate_m))
 
 
 def _of_nothing(
     overview: Overview, view: PanelProjection, panel: Panel, shown: Sequence[Shown], places: Array
 ) -> Array:
-    """(N, LENGTH) looks of the sub-objects that are no object, nor where one may be that did not show."""
+    """Return the looks (N, LENGTH) of the sub-objects that belong to no object, shown or not."""
     middles = np.array([each.place_px for each in shown])
     away = np.linalg.norm(places[:, None] - middles, axis=2).min(axis=1)
     is_nothing = away > PART_M * PLATE_PX_PER_M
@@ -207,7 +214,7 @@ def _of_nothing(
 def _grown(
     overview: Overview, shown: Sequence[Shown], nothing: Array, knowledge: Knowledge, source: str
 ) -> tuple[Knowledge, dict[str, int]]:
-    """The knowledge with what it does not tell yet, and how many looks every kind got."""
+    """Return the knowledge with the looks that it does not imply yet, and the number of new looks per kind."""
     own = look_at(overview.ground, np.array([each.place_px for each in shown]))
     looks = np.round(np.vstack([own, nothing]) * UNIT) / UNIT  # as the files have them
     names = np.array([each.panel_object.kind for each in shown] + [NOTHING] * len(nothing))
@@ -230,13 +237,14 @@ def _grown(
 
 
 def _recognised(overview: Overview, places: Array, shown: Sequence[Shown], knowledge: Knowledge) -> tuple[str, ...]:
-    """Names of the objects that are recognised blind in this overview."""
+    """Return the names of the objects that blind recognition finds in this overview."""
     looks = look_at(overview.ground, places)
     found = chosen(overview.ground, places, looks, knowledge, overview.view, overview.plate_m)
     return tuple(each.panel_object.name for each in shown if any(_is(each, candidate) for candidate in found))
 
 
 def _is(shown: Shown, candidate: Detection) -> bool:
+    """Return whether a detection is the given object."""
     if candidate.reason is not None or candidate.kind != shown.panel_object.kind:
         return False
     reach_px = 0.5 * float(np.ptp(shown.box_px, axis=0).max())

@@ -1,7 +1,8 @@
-"""Teaching: one image and at most three clicks make a new kind, or a further look of a known one.
+"""Teaching of a new kind, or of a further look of a known one, from one image and at most three clicks.
 
-A further look is only taken when it takes nothing away from another kind: every look that the others were taught keeps
-its own kind as the likest. `check` shows what the system now finds. Whole panels: `panel_teach`.
+A further look is accepted only if it does not make another kind's examples ambiguous: every look that was taught for
+another kind must stay nearest to its own kind. `check` shows what the system now finds. For whole panels see
+`panel_teach`.
 """
 
 from __future__ import annotations
@@ -24,50 +25,51 @@ from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
 from perception.vision.projection import PanelProjection, homography
 from perception.vision.teaching.sub_object import SubObject, outline_at
 
-SNAP_M = 0.004  # a click is taken to the middle of the sub-object that lies that near
-ABOUT_M = 0.012  # further middles of the same object: hub and face of a gauge are not quite concentric
-SAME_LOOK = 0.10  # a look this near to one already taught teaches nothing
-ROBBED = 0.2  # a taught look that near to the new one could be taken for it
+SNAP_M = 0.004  # a click is moved to the middle of a sub-object that is so near
+# Radius of further middles of the same object, because hub and face of a gauge are not quite concentric.
+ABOUT_M = 0.012
+SAME_LOOK = 0.10  # a look that is so near to one already taught adds nothing
+ROBBED = 0.2  # a taught look that is so near to the new one could be classified as the new kind
 NOTHING_SIZE_M = (0.010, 0.010)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Overview:
-    """An image of one panel, laid straight: made once, taught from as often as wanted."""
+    """The rectified image of one panel, from which any number of examples can be taught."""
 
     view: PanelProjection
     ground: Ground
     plate_m: tuple[float, float]
 
     def on_ground(self, points_m: ArrayLike) -> Array:
-        """(N, 2) plate points (m, origin in the middle, y up) as pixels of the rectified plate."""
+        """Convert plate points (N, 2; m, origin in the middle, y up) to pixels of the rectified plate."""
         points = np.asarray(points_m, float)
         half = np.array(self.plate_m) / 2
         return np.asarray(np.column_stack([points[:, 0] + half[0], half[1] - points[:, 1]]) * PLATE_PX_PER_M)
 
     def on_plate(self, points_px: ArrayLike) -> Array:
-        """The inverse of `on_ground`."""
+        """Convert pixels of the rectified plate to plate points, the inverse of `on_ground`."""
         points = np.asarray(points_px, float) / PLATE_PX_PER_M
         return np.column_stack([points[:, 0] - self.plate_m[0] / 2, self.plate_m[1] / 2 - points[:, 1]])
 
     def in_image(self, points_m: ArrayLike) -> Array:
-        """(N, 2) pixels of the image under plate points."""
+        """Return the pixels (N, 2) of the image at plate points."""
         points = np.asarray(points_m, float)
         return self.view.project(np.column_stack([points, np.zeros(len(points))]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Example:
-    """What was clicked on.
+    """The object that was clicked.
 
     Attributes:
         clicks_m: (1..3, 2) on the plate.
         centre_m: (2,) middle of the sub-object, on the plate (origin in its middle, y up).
-        outline: what was found about it on the rectified plate; None only for `nothing`.
-        outline_px: (N, 2) the same in the image; (0, 2) where there is none.
+        outline: the outline found on the rectified plate; None only for `nothing`.
+        outline_px: (N, 2) the same in the image; (0, 2) if there is none.
         size_m: width and height of the outline on the plate.
         look: (LENGTH,) see `perception.vision.look`.
-        noisy: whether the image is.
+        noisy: whether the image is noisy.
     """
 
     clicks_m: Array
@@ -81,14 +83,14 @@ class Example:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lesson:
-    """What a teaching step made of it.
+    """Result of teaching one example.
 
     Attributes:
         knowledge: with the new look.
         kind: the kind that was taught.
-        example: what was clicked on.
+        example: the object that was clicked.
         is_new_kind: whether the kind did not exist before.
-        added: False when the look was known already.
+        added: False if the look was already known.
     """
 
     knowledge: Knowledge
@@ -99,7 +101,7 @@ class Lesson:
 
     @property
     def centre_m(self) -> Array:
-        """(2,) where on the plate (origin in its middle, y up)."""
+        """Position (2,) on the plate (origin in its middle, y up)."""
         return self.example.centre_m
 
 
@@ -108,18 +110,19 @@ def teach(
     size_m: tuple[float, float] | None = None, plate_m: tuple[float, float] = PLATE_M, view: PanelProjection | None = None,
     source: str = "",
 ) -> Lesson:  # fmt: skip
-    """Teach that there is a `kind` at the clicked place.
+    """Teach that there is an object of a `kind` at the clicked position.
 
     Args:
-        clicks_px: one click in the middle, or two on opposite corners, or three: two corners and the middle, where
-            that is not half way.
-        size_m: width and height on the plate; from the outline found or the kind if left out.
+        clicks_px: one click in the middle; two on opposite corners; or three, two corners and the middle, if that is
+        not
+            half way between them.
+        size_m: width and height on the plate; by default those of the kind, or of the outline found.
         source: a remark for the knowledge file.
 
     Raises:
         InvalidRequest: no or too many clicks.
-        NotFound: no plate, the click is not on it, or nothing is there.
-        Ambiguous: two panels are in view, or the look would take examples away from another kind; says which.
+        NotFound: no plate, the click is not on it, or there is no object.
+        Ambiguous: two panels are in view, or examples of another kind would be classified as this one; says which.
     """
     overview = overview_of(image, plate_m=plate_m, view=view)
     return teach_example(
@@ -132,7 +135,7 @@ def overview_of(
     image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, view: PanelProjection | None = None,
     focal_px: float | None = None,
 ) -> Overview:  # fmt: skip
-    """The image of one panel, ready to be taught from.
+    """Rectify the image of one panel for teaching.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
@@ -144,11 +147,11 @@ def overview_of(
 
 
 def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, kind: str = "") -> Example:
-    """The object at one to three clicks.
+    """Return the object at one to three clicks.
 
     Raises:
         InvalidRequest: no or too many clicks.
-        NotFound: a click beside the plate, or nothing there.
+        NotFound: a click is not on the plate, or there is no object.
     """
     if not 1 <= len(clicks_px) <= 3:
         raise InvalidRequest(f"{len(clicks_px)} clicks", hint="click the middle, or two opposite corners, or both")
@@ -176,7 +179,7 @@ def teach_example(
     """Add an example to a kind; see `teach`.
 
     Raises:
-        Ambiguous: the look would take examples away from another kind; says which.
+        Ambiguous: examples of another kind would be classified as this one; says which.
     """
     known, look = knowledge.kind(kind), example.look
     in_use = knowledge.for_image(noisy=example.noisy)
@@ -199,7 +202,10 @@ def teach_example(
 
 
 def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Detection | None:
-    """What the example is taken for now, with the reason if it is refused; None: unlike everything taught."""
+    """Return what the example is recognised as now, with the reason if refused.
+
+    None if it is unlike everything taught.
+    """
     places = candidate_places(overview.ground.edges)
     middle = overview.on_ground(example.centre_m[None])[0]
     if example.outline is not None:
@@ -211,7 +217,7 @@ def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Detect
 
 
 def robbed_kinds(knowledge: Knowledge, kind: str, look: Array) -> tuple[str, ...]:
-    """Kinds of which a taught look would be liker to the new look than to the rest of its own kind."""
+    """Return the kinds of which a taught look is nearer to the new look than to the other looks of its own kind."""
     new = TaughtKind(name=kind, size_m=NOTHING_SIZE_M, looks=look[None])
     robbed = []
     for other in knowledge.kinds:
@@ -226,7 +232,7 @@ def robbed_kinds(knowledge: Knowledge, kind: str, look: Array) -> tuple[str, ...
 
 
 def _to_own_kind(knowledge: Knowledge, kind: TaughtKind, index: int) -> float:
-    """How far one look of a kind is from the kind's others; infinity for an only one."""
+    """Return the distance of one look of a kind from the kind's other looks; infinity if it is the only one."""
     if len(kind.looks) < 2:
         return float("inf")
     rest = TaughtKind(name=kind.name, size_m=kind.size_m, looks=np.delete(kind.looks, index, axis=0))
@@ -240,15 +246,15 @@ def check(
     plate_m: tuple[float, float] = PLATE_M,
     view: PanelProjection | None = None,
 ) -> tuple[Detection, ...]:
-    """What the system finds now: the objects first, then what it refuses and why."""
+    """Return what the system finds now: objects first, then refusals with their reasons."""
     return recognise(image, knowledge, plate_m=plate_m, view=view)
 
 
 def plate_points(view: PanelProjection, clicks_px: ArrayLike, plate_m: tuple[float, float]) -> Array:
-    """(N, 2) plate points (m, origin in the middle, y up) under pixels.
+    """Return the plate points (N, 2; m, origin in the middle, y up) at pixels.
 
     Raises:
-        NotFound: a click lies beside the plate.
+        NotFound: a click is not on the plate.
     """
     points = under_pixels(view, clicks_px, plate_m)
     if (np.abs(points) > [plate_m[0] / 2, plate_m[1] / 2]).any():
@@ -257,7 +263,10 @@ def plate_points(view: PanelProjection, clicks_px: ArrayLike, plate_m: tuple[flo
 
 
 def under_pixels(view: PanelProjection, pixels: ArrayLike, plate_m: tuple[float, float]) -> Array:
-    """(N, 2) points of the plate's plane (m, origin in the plate's middle, y up) under pixels, beside the plate too."""
+    """Return the points (N, 2.
+
+    M, origin in the plate's middle, y up) of the plate's plane at pixels, also beyond the plate.
+    """
     w, h = plate_m[0] / 2, plate_m[1] / 2
     corners = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
     plate_from_px = homography(view.project(np.column_stack([corners, np.zeros(4)])), corners)
@@ -267,7 +276,7 @@ def under_pixels(view: PanelProjection, pixels: ArrayLike, plate_m: tuple[float,
 
 
 def _size_m(clicks_m: Array, outline: SubObject | None) -> tuple[float, float]:
-    """Of the outline; of `nothing` what the clicks span."""
+    """Return width and height of the outline, or of the box that the clicks span (`nothing`)."""
     if outline is not None:
         width, height = outline.size_px / PLATE_PX_PER_M
         return float(width), float(height)
@@ -278,6 +287,7 @@ def _size_m(clicks_m: Array, outline: SubObject | None) -> tuple[float, float]:
 
 
 def _snapped(place: Array, candidates: Array) -> Array:
+    """Return the nearest candidate place if it is near enough, else the given place."""
     if not len(candidates):
         return place
     away = np.linalg.norm(candidates - place, axis=1)
@@ -286,9 +296,10 @@ def _snapped(place: Array, candidates: Array) -> Array:
 
 
 def _distance(look: Array, knowledge: Knowledge, kind: TaughtKind) -> float:
-    """Of a (LENGTH,) look to the nearest of a kind's."""
+    """Return the distance of a look (LENGTH,) from the nearest look of a kind."""
     return float(distances(look[None], _only(knowledge, kind))[0, 0])
 
 
 def _only(knowledge: Knowledge, kind: TaughtKind) -> Knowledge:
+    """Return the knowledge with that kind only."""
     return replace(knowledge, kinds=(kind,))

@@ -1,4 +1,4 @@
-"""The border lights of a new panel: clicked on, or found in the four corners of its plate."""
+"""Border lights of a new panel: clicked, or found in the four corners of its plate."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from perception.vision.teaching.lesson import Overview, plate_points
 from perception.vision.teaching.sub_object import sub_objects
 
 SIDES = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], float)
-LIGHT_INSET_M = 0.015  # where lights are put when none are seen: the file says that it is a guess
-LIGHT_REACH_M = 0.06  # how far from its corner a border light may sit
+LIGHT_INSET_M = 0.015  # assumed distance of a light from both edges if none are found; the file says that it is a guess
+LIGHT_REACH_M = 0.06  # largest distance of a border light from its corner
 LIGHT_RADII_M = (0.003, 0.014)
-LIGHTS_AGREE_M = 0.006  # border lights sit alike in their corners
-SNAP_M = 0.006
+LIGHTS_AGREE_M = 0.006  # largest difference between the positions of the lights relative to their corners
+SNAP_M = 0.006  # a click is moved to a circle that is so near
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LightsFound:
-    """(4, 2) border lights on the plate, upper left first and clockwise; `are_seen` False: put there by a guess."""
+    """Border lights on the plate (4, 2), upper left first and clockwise; `are_seen` is False if they are a guess."""
 
     places_m: Array
     are_seen: bool
 
 
 def find_border_lights(overview: Overview, clicks_px: Sequence[tuple[float, float]] = ()) -> LightsFound:
-    """The four border lights: those clicked on, or the small circles that sit alike in the four corners.
+    """Return the four border lights: those clicked, or small circles at corresponding positions in the four corners.
 
     Raises:
-        InvalidRequest: neither none nor four clicks.
-        NotFound: a click beside the plate.
+        InvalidRequest: the number of clicks is neither zero nor four.
+        NotFound: a click is not on the plate.
     """
     if len(clicks_px) not in (0, 4):
         raise InvalidRequest(
@@ -62,20 +62,20 @@ def find_border_lights(overview: Overview, clicks_px: Sequence[tuple[float, floa
 
 
 def _in_corner(corner: Array, circles: Array) -> Array | None:
-    """The circle nearest to a corner of the plate, if one is near."""
+    """Return the circle nearest to a corner of the plate; None if none is near."""
     away = np.abs(circles - corner).max(axis=1, initial=0.0)
     near = np.flatnonzero(away < LIGHT_REACH_M)
     return circles[near[int(away[near].argmin())]] if len(near) else None
 
 
 def _near(place: Array, circles: Array) -> Array:
-    """The middle of the circle that was clicked on, or the click."""
+    """Return the middle of the circle that was clicked, or the click if there is none."""
     away = np.linalg.norm(circles - place, axis=1)
     return np.asarray(circles[int(away.argmin())] if len(away) and away.min() < SNAP_M else place)
 
 
 def _clockwise(places: Array) -> list[int]:
-    """Order of four places: upper left, upper right, lower right, lower left."""
+    """Return the order of four places: upper left, upper right, lower right, lower left."""
     rows = np.argsort(-places[:, 1], kind="stable")
     (a, b), (c, d) = (sorted(rows[k : k + 2], key=lambda i: float(places[i, 0])) for k in (0, 2))
     return [int(a), int(b), int(d), int(c)]

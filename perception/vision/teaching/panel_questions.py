@@ -1,4 +1,4 @@
-"""What must be asked about each object of a new panel; every question has an answer that stands when nothing is said."""
+"""Questions about each object of a new panel; every question has an answer that holds if the user gives none."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ NAME = Question(key="name", text="What is it called (a short name: small letters
 
 
 def kind_question(knowledge: Knowledge, suggested: str = "") -> Question:
-    """The first question about what was clicked."""
+    """Return the first question about a clicked object, that for its kind."""
     known = sorted({*installed_kinds(), *(kind.name for kind in knowledge.kinds)} - {NOTHING})
     return Question(key="kind", text="What kind of object is this?", choices=tuple(known), default=suggested)
 
 
 def questions(kind: str) -> tuple[Question, ...]:
-    """What must be known of one clicked object to write it into a panel file.
+    """Return the questions whose answers are needed to write a clicked object into a panel file.
 
     Raises:
-        InvalidRequest: a panel file knows no such kind.
+        InvalidRequest: panel files have no such kind.
     """
     if kind not in installed_kinds():
         raise InvalidRequest(

@@ -1,7 +1,8 @@
-"""A whole new panel from one image: every object is clicked on, a few questions are answered, and TOML comes out.
+"""Teaching of a whole new panel from one image: clicks on the objects and answers to questions become a TOML file.
 
 The paper: "The user is directed through a question-answer sequence to acquire the description of [...] various objects
-and their subparts" (section II-A). Places and sizes come from the outlines under the clicks, the rest from the answers.
+and their subparts" (section II-A). Positions and sizes come from the outlines under the clicks, the rest from the
+answers.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ class PanelObjectDraft:
 
 
 def panel_text(name: str, overview: Overview, lights: LightsFound, objects: Sequence[PanelObjectDraft]) -> str:
-    """TOML of a panel file.
+    """Return the TOML text of a panel file.
 
     Raises:
-        InvalidRequest: an answer is no number or no choice; names object and question.
-        ConfigError: what came out is no panel: a name twice, an object off the plate.
+        InvalidRequest: an answer is not a number or not one of the choices; names object and question.
+        ConfigError: the result is not a valid panel: a repeated name, or an object that is not on the plate.
     """
     width, height = overview.plate_m
     top: dict[str, Any] = {"schema": 1, "name": name, "width_m": width, "height_m": height}
@@ -58,10 +59,10 @@ def panel_text(name: str, overview: Overview, lights: LightsFound, objects: Sequ
 
 
 def object_row(draft: PanelObjectDraft, overview: Overview) -> dict[str, Any]:
-    """One object's keys of the panel file: from its outline, and from the answers.
+    """Return the keys of one object in the panel file, from its outline and the answers.
 
     Raises:
-        InvalidRequest: an answer is no number or no choice; names object and question.
+        InvalidRequest: an answer is not a number or not one of the choices; names object and question.
     """
     asked = {question.key: question for question in questions(draft.kind)[1:]}
     unknown = sorted(set(draft.answers) - set(asked) - {"name"})
@@ -77,7 +78,7 @@ def object_row(draft: PanelObjectDraft, overview: Overview) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Replies:
-    """The answers about one object, read as what they mean."""
+    """The answers about one object, converted to the types of the panel file's keys."""
 
     draft: PanelObjectDraft
     asked: Mapping[str, Question]
@@ -85,7 +86,10 @@ class _Replies:
 
     @property
     def centre_m(self) -> Array:
-        """What turns about a hub does so where it was clicked; everything else sits in the middle of its outline."""
+        """Position (2,) of the object on the plate.
+
+        An object that turns about a hub is where it was clicked; any other is in the middle of its outline.
+        """
         example = self.draft.example
         if kind_model(self.draft.kind).turns_about_click and len(example.clicks_m) != 2:
             return np.asarray(example.clicks_m[-1])
@@ -94,6 +98,7 @@ class _Replies:
         return np.asarray(self.overview.on_plate(example.outline.middle_px[None])[0])
 
     def text(self, key: str) -> str:
+        """Return the answer to a question, or its default; raises InvalidRequest if it is not one of the choices."""
         question = self.asked[key]
         given = self.draft.answers.get(key, "").strip() or question.default
         if question.choices and given not in question.choices:
@@ -103,15 +108,18 @@ class _Replies:
         return given
 
     def number(self, key: str) -> float:
+        """Return the answer to a question as a number."""
         return _number(self.text(key), f"{self.draft.name}: {key!r}")
 
     @property
     def size_m(self) -> tuple[float, float]:
+        """Width and height of the outline."""
         width, height = self.draft.example.size_m
         return float(width), float(height)
 
     @property
     def reach_m(self) -> float:
+        """Largest distance of the outline from the last click, along x or y."""
         example = self.draft.example
         if example.outline is None or len(example.clicks_m) == 2:
             return max(self.size_m) / 2
@@ -119,11 +127,16 @@ class _Replies:
         return float(np.abs(corners - example.clicks_m[-1]).max())
 
     def states(self, key: str) -> list[dict[str, Any]]:
+        """Return named angles from an answer such as "off=-45, on=45"."""
         pairs = [part.partition("=") for part in self.text(key).split(",")]
         what = f"{self.draft.name}: place"
         return [{"name": n.strip(), "angle_deg": _number(a, f"{what} {n.strip()!r}")} for n, _, a in pairs]
 
     def mark_deg(self, key: str, *, pivot_below_m: float = 0.0) -> float:
+        """Return the angle of a mark, clockwise from up: the answer itself, or that of the pixel "u,v" in it.
+
+        `pivot_below_m`: distance of the pivot below the object's middle.
+        """
         text = self.text(key)
         if "," not in text:
             return self.number(key)
@@ -133,10 +146,12 @@ class _Replies:
 
 
 def _metres(place: Array) -> list[float]:
+    """Return a place rounded to 0.1 mm."""
     return [round(float(x), 4) for x in place]
 
 
 def _number(text: str, what: str) -> float:
+    """Return the text as a finite number; raises InvalidRequest if it is none."""
     try:
         value = float(text)
     except ValueError:

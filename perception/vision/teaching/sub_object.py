@@ -1,4 +1,4 @@
-"""The outline under a click: the circle, the rectangle or the closed group of edges at which a person would point."""
+"""The outline at a click: the circle, the rectangle or the connected group of edges that a person would point at."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from perception.vision.finding.components import components
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground
 from perception.vision.finding.shapes import direction_maps, find_rectangles
 
-RADII_M = (CIRCLE_RADII_M, (0.036, 0.075))  # as the blind search, and larger: a person may point at anything
+# Those of the blind search, and larger ones, because a person may point at anything.
+RADII_M = (CIRCLE_RADII_M, (0.036, 0.075))
 SIDES_M = (FOUND_SIDES_M, (0.06, 0.16))
 LEAST_GROUP_M = 0.008
-NEAR_M = 0.006  # a click in the middle is that near to it
-SURE_COVERAGE = 0.6  # of an outline that is mostly there; weaker ones count where no sure one is
-LEAST_OVERLAP = 0.4  # of a found outline's box with the clicked box: with less the person meant something else
-LEAST_EDGES = 12  # strong edge pixels inside a clicked box: bare plate has none, the smallest lamp has forty
+NEAR_M = 0.006  # largest distance of a click in the middle of an outline from its middle
+SURE_COVERAGE = 0.6  # of an outline of which most is visible; weaker ones are used if there is none
+LEAST_OVERLAP = 0.4  # of an outline's box with the clicked box; with less the person meant something else
+LEAST_EDGES = 12  # strong edge pixels inside a clicked box; the bare plate has none, the smallest lamp has forty
 ARC = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
 
 
@@ -33,7 +34,7 @@ class SubObject:
     Attributes:
         shape: `circle`, `rectangle`, `group` (edges that belong together) or `clicks` (nothing better was found).
         polygon_px: (N, 2) closed outline (u, v) on the rectified plate.
-        coverage: share of the outline that is an edge; 0 for groups and clicks.
+        coverage: share of the outline on which there is an edge; 0 for groups and clicks.
     """
 
     shape: str
@@ -42,17 +43,17 @@ class SubObject:
 
     @property
     def middle_px(self) -> Array:
-        """(2,) middle of the box around the outline."""
+        """Middle (2,) of the outline's bounding box."""
         return np.asarray((self.polygon_px.min(axis=0) + self.polygon_px.max(axis=0)) / 2)
 
     @property
     def size_px(self) -> Array:
-        """(2,) width and height of that box."""
+        """Width and height (2,) of that box."""
         return np.asarray(np.ptp(self.polygon_px, axis=0))
 
 
 def sub_objects(ground: Ground) -> list[SubObject]:
-    """All closed outlines on the plate that could be an object's."""
+    """Return all closed outlines on the plate that may be those of objects."""
     s, edges = PLATE_PX_PER_M, ground.edges
     found = []
     for low, high in RADII_M:
@@ -73,13 +74,13 @@ def sub_objects(ground: Ground) -> list[SubObject]:
 
 
 def outline_at(ground: Ground, clicks_px: Array) -> SubObject:
-    """What the clicks point at.
+    """Return the outline that the clicks point at.
 
     Args:
         clicks_px: (1..3, 2) on the rectified plate: the middle; two opposite corners; both.
 
     Raises:
-        NotFound: nothing but bare plate there.
+        NotFound: there is only bare plate.
     """
     found = sub_objects(ground)
     chosen = _about(found, clicks_px[0]) if len(clicks_px) == 1 else _in_box(found, clicks_px[:2])
@@ -95,7 +96,7 @@ def outline_at(ground: Ground, clicks_px: Array) -> SubObject:
 
 
 def _about(found: list[SubObject], click: Array) -> SubObject | None:
-    """The largest sure outline about a click in its middle; else the smallest one that holds the click."""
+    """Return the largest well visible outline whose middle is clicked, else the smallest one around the click."""
     near = [o for o in found if np.linalg.norm(o.middle_px - click) < NEAR_M * PLATE_PX_PER_M]
     for least in (SURE_COVERAGE, 0.01, 0.0):
         fitting = [o for o in near if o.coverage >= least]
@@ -106,7 +107,10 @@ def _about(found: list[SubObject], click: Array) -> SubObject | None:
 
 
 def _in_box(found: list[SubObject], corners: Array) -> SubObject | None:
-    """The outline whose box is likest to the clicked one; circles and rectangles before groups."""
+    """Return the outline whose box is most similar to the clicked one.
+
+    Circles and rectangles are preferred to groups.
+    """
     low, high = corners.min(axis=0), corners.max(axis=0)
 
     def likeness(o: SubObject) -> float:
@@ -120,13 +124,16 @@ def _in_box(found: list[SubObject], corners: Array) -> SubObject | None:
 
 
 def _holds(outline: SubObject, point: Array) -> bool:
+    """Return whether an outline contains a point."""
     return cv2.pointPolygonTest(outline.polygon_px.astype(np.float32), (float(point[0]), float(point[1])), False) >= 0
 
 
 def _has_edges(ground: Ground, corners: Array) -> bool:
+    """Return whether there are enough edges in the box between two corners."""
     (u0, v0), (u1, v1) = (np.rint(c).astype(int) for c in (corners.min(axis=0), corners.max(axis=0)))
     return int(ground.edges.thin[max(v0, 0) : v1 + 1, max(u0, 0) : u1 + 1].sum()) >= LEAST_EDGES
 
 
 def _box(u0: float, v0: float, u1: float, v1: float) -> Array:
+    """Return the corners (4, 2) of a box."""
     return np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]], float)

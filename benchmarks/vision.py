@@ -45,7 +45,7 @@ Job = dict[str, Any]
 
 
 def panel_of_job(job: Job) -> Panel:
-    """The panel file that a job's layout amounts to: metres, y up, origin in the middle."""
+    """Return a job's layout as a panel: metres, y up, origin in the centre."""
     width, height = (v / 1000 for v in job["panel_mm"])
     reach = 0.45
     light = [
@@ -55,7 +55,7 @@ def panel_of_job(job: Job) -> Panel:
     tables = [_object(entry, job["panel_mm"]) for entry in job["layout"]]
     source = str(job["id"])
     objects = (validate(table, kind_model(table["kind"]), source=source) for table in tables)
-    # Not validated as a whole: a drawing is read as it is, also where its objects overlap or cover a nominal light.
+    # Not validated as a whole, because in drawings objects may overlap or cover a nominal light.
     return Panel.model_construct(
         name="job",
         width_m=width,
@@ -66,7 +66,7 @@ def panel_of_job(job: Job) -> Panel:
 
 
 def _by_meaning(panel_object: PanelObject) -> PanelObject:
-    """A lever whose opposite stops have one name: a panel file names every state once, a job only what it means."""
+    """Return a lever whose opposite stops have the same state name, as in a job; in a panel file their names differ."""
     if not isinstance(panel_object, Lever):
         return panel_object
     states = tuple(state.model_copy(update={"name": state.name.split("_")[0]}) for state in panel_object.states)
@@ -74,7 +74,7 @@ def _by_meaning(panel_object: PanelObject) -> PanelObject:
 
 
 def view_of_job(job: Job) -> PlateProjection:
-    """The job's homography guess over panel metres."""
+    """Return the job's approximate homography, as a projection of panel metres."""
     w, h = job["panel_mm"]
     mm_from_m = np.array([[1000.0, 0, w / 2], [0, -1000.0, h / 2], [0, 0, 1]])
     corners = np.array([[-w / 2, h / 2], [w / 2, h / 2], [w / 2, -h / 2], [-w / 2, -h / 2]]) / 1000
@@ -174,7 +174,7 @@ def _slider(entry: Job, w: float, h: float, part: dict[str, float]) -> dict[str,
 
 
 def taught_answer(job: Job, image: Image, *, least_confidence: float = ANSWER_AT) -> dict[str, Any]:
-    """Answer of a `taught` job."""
+    """Return the answer to a `taught` job."""
     panel = panel_of_job(job)
     view = view_of_job(job)
     readings = inspect_view(image, as_gray(image), view, panel, digits_taught=False, least_confidence=least_confidence)
@@ -182,7 +182,7 @@ def taught_answer(job: Job, image: Image, *, least_confidence: float = ANSWER_AT
 
 
 def _answer(entry: Job, reading: ObjectReading) -> dict[str, Any]:
-    """One object's answer. What is refused has no value; of a display its likeliest number, which is no answer."""
+    """Return the answer for one object; a refused one has no value, but a display's most likely number is reported."""
     out: dict[str, Any] = {
         "id": entry["id"],
         "cls": entry["cls"],
@@ -204,7 +204,7 @@ def _answer(entry: Job, reading: ObjectReading) -> dict[str, Any]:
 
 
 def blind_answer(job: Job, image: Image) -> dict[str, Any]:
-    """Answer of a `blind` job."""
+    """Return the answer to a `blind` job."""
     width, height = (v / 1000 for v in job["panel_mm"])
     found = recognise(image, _knowledge(), plate_m=(width, height))
     return {"objects": [
@@ -215,7 +215,7 @@ def blind_answer(job: Job, image: Image) -> dict[str, Any]:
 
 
 def lights_answer(job: Job, folder: Path) -> dict[str, Any]:
-    """Answer of a `lights` job: the visible ones of the four."""
+    """Return the answer to a `lights` job: the visible lights of the four."""
     off, on = (decode((folder / job[key]).read_bytes()) for key in ("off", "on"))
     blobs = find_lights(off, on)
     lights = np.array(job["lights_mm"], float) / 1000
@@ -227,14 +227,14 @@ def lights_answer(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def status_answer(status: PatchReading, key: str) -> dict[str, Any]:
-    """Answer of a `dial` or `display` job."""
+    """Return the answer to a `dial` or `display` job."""
     value = status.value if key == "reading" else status.text
     out = {"confidence": status.confidence, "reason": status.reason}
     return {**out, key: value} if status.answered else out
 
 
 def answer(job: Job, folder: Path, *, least_confidence: float = ANSWER_AT) -> dict[str, Any]:
-    """Answer of any job; what is refused as a whole has its reason in `refused`."""
+    """Return the answer to any job; if the whole job is refused, `refused` states the reason."""
     try:
         if job["mode"] == "lights":
             return lights_answer(job, folder)
@@ -263,9 +263,9 @@ def _knowledge() -> Knowledge:
 
 
 def run(jobs: list[Job], folder: Path, *, timed: bool, least_confidence: float = ANSWER_AT) -> dict[str, Any]:
-    """Answers by job id; the first job of every mode is done twice, so that compiling is not timed.
+    """Return the answers by job id; the first job of every mode is run twice, so that compilation is not timed.
 
-    Times are of the processor, one thread: what other work on the machine adds is left out.
+    Times are CPU times of one thread, so that other work on the machine does not count.
     """
     answers: dict[str, Any] = {}
     warm: set[str] = set()
@@ -281,7 +281,7 @@ def run(jobs: list[Job], folder: Path, *, timed: bool, least_confidence: float =
 
 
 def main(arguments: list[str]) -> int:
-    """Entry point; returns the exit status."""
+    """Run the command line; return the exit status."""
     cv2.setNumThreads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="*", type=Path, metavar="INPUTS.json OUT.json")
@@ -307,7 +307,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _folder_of(source: Path, jobs: list[Job]) -> Path:
-    """Where the images lie: beside the inputs file, or in the shared data."""
+    """Return the folder of the images: beside the inputs file, or in the shared data."""
     first = next((job.get("image") or job.get("on") for job in jobs), "")
     for folder in (source.parent, DATA / "synth_dev", DATA / "real"):
         if (folder / str(first)).exists():

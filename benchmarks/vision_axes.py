@@ -1,4 +1,4 @@
-"""Robustness of taught reading, one axis at a time: the shipped panel drawn through a camera, disturbed in one way."""
+"""Measures the robustness of taught reading, one axis at a time: the shipped panel is drawn with one disturbance."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ SEEDS = range(3)
 
 
 def shipped_panel() -> Panel:
-    """The panel of the bench cell."""
+    """Return the panel of the bench cell."""
     return load_cell(ROOT / "cells" / "bench.toml").panel
 
 
 def axes() -> list[Answer]:
-    """Prints every axis alone, read right, refused, and wrong by more than 5 % FS; returns the answers."""
+    """Print for each axis what is read correctly, refused, and wrong by more than 5 % FS; return the answers."""
     panel = shipped_panel()
     answers: list[Answer] = []
     print("\nrobustness, one axis at a time (shipped panel, drawn): read right / refused / wrong above 5 % FS")
@@ -102,7 +102,7 @@ def _axis(
 
 
 def random_state(panel: Panel, seed: int) -> dict[str, Shown]:
-    """What every object shows: any value or state, the same for the same seed."""
+    """Return a random value or state for every object, the same for the same seed."""
     random = np.random.default_rng(seed)
     shown: dict[str, Shown] = {}
     for panel_object in panel.objects:
@@ -128,7 +128,7 @@ def random_state(panel: Panel, seed: int) -> dict[str, Shown]:
 
 
 def _error(panel: Panel, reading: Any, shown: Shown) -> float | None:
-    """Error in % of full scale, 100 for a wrong state or text, None for a refusal."""
+    """Return the error in % of full scale, 100 for a wrong state or text, None for a refusal."""
     if not reading.answered:
         return None
     if reading.text is not None or reading.state is not None:
@@ -136,5 +136,5 @@ def _error(panel: Panel, reading: Any, shown: Shown) -> float | None:
     if reading.kind == "handwheel":
         return float(abs((reading.value - float(shown) + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi) * 100)
     span = panel.object(reading.name).full_scale
-    assert span is not None  # all other kinds have one
+    assert span is not None  # all other kinds have a span
     return float(abs(reading.value - float(shown)) / span * 100)

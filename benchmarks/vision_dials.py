@@ -1,6 +1,6 @@
-"""Drawn photographs of single dials in many looks, with known readings: faces, pointers, sizes, glare, JPEG.
+"""Draws photographs of single dials of many designs with known readings: faces, pointers, sizes, glare, JPEG.
 
-They are for judging the reader where no photographs with known values are at hand; nothing in it is fitted to them.
+They test the reader where no photographs with known values exist; the reader was not tuned on them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnDial:
-    """A picture (H, W, 3) uint8 of a dial from 0 to 10, what it shows, and whether its scale is a full turn from the top."""
+    """Image (H, W, 3) uint8 of a dial from 0 to 10, its reading, and whether its scale is a full turn from the top."""
 
     image: Image
     reading: float
@@ -37,7 +37,7 @@ class DrawnDial:
 
 
 def draw_dial(seed: int) -> DrawnDial:
-    """A dial of a look of its own; the same for the same seed."""
+    """Draw a dial of random design, the same for the same seed."""
     rng = np.random.default_rng(seed)
     circular, share = bool(rng.random() < 0.5), float(rng.uniform(0.02, 0.98))
     face = FACES[int(rng.integers(len(FACES)))]
@@ -53,7 +53,7 @@ def draw_dial(seed: int) -> DrawnDial:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pen:
-    """Draws about a dial's middle, in shares of its radius: `up` along a direction, `right` across it."""
+    """Draws in units of a dial's radius from its centre; coordinates are (up, right), along and across a direction."""
 
     canvas: NDArray[np.uint8]
     middle: Array
@@ -73,7 +73,7 @@ class Pen:
         return pen
 
     def place(self, angle_rad: float, at: ArrayLike) -> tuple[int, int]:
-        """Canvas pixels, times 16, of (up, right)."""
+        """Return the canvas pixels, times 16, of (up, right) for a direction."""
         up, right = np.asarray(at, float) * self.radius
         s, c = np.sin(angle_rad), np.cos(angle_rad)
         x, y = self.middle + np.array([up * s + right * c, -up * c + right * s])
@@ -122,7 +122,7 @@ def _pointer(pen: Pen, rng: Rng, angle: float, shape: str, colour: Colour, ink: 
 
 
 def _photographed(canvas: NDArray[np.uint8], rng: Rng) -> Image:
-    """The canvas seen a little aslant, at its final size, through light, lens, noise and JPEG."""
+    """Return the canvas seen slightly at an angle, at its final size, after light, lens, noise and JPEG."""
     azimuth = float(rng.uniform(0, 2 * np.pi))
     aslant = seen_aslant(canvas, azimuth, float(rng.uniform(0, 0.06)))
     side = round(np.exp(rng.uniform(np.log(SMALLEST_PX), np.log(LARGEST_PX))))
@@ -144,7 +144,7 @@ def _photographed(canvas: NDArray[np.uint8], rng: Rng) -> Image:
 
 
 def seen_aslant(canvas: Image, azimuth_rad: float, depth: float) -> Image:
-    """The canvas with one side as much smaller as the other is larger."""
+    """Return the canvas in perspective: one side is smaller and the opposite side larger by the same amount."""
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32) * CANVAS_PX
     from_middle = corners - CANVAS_PX / 2
     away = from_middle @ np.array([np.cos(azimuth_rad), np.sin(azimuth_rad)]) * 2 / CANVAS_PX
@@ -154,7 +154,7 @@ def seen_aslant(canvas: Image, azimuth_rad: float, depth: float) -> Image:
 
 
 def error_of(dial: DrawnDial) -> tuple[float | None, float]:
-    """Error of the reader in % of the scale (None if it refuses), and its confidence."""
+    """Return the reader's error in % of the scale (None if it refuses) and its confidence."""
     status = read_dial(dial.image, minimum=0.0, maximum=10.0, circular=dial.circular)
     if status.value is None:
         return None, status.confidence
@@ -164,7 +164,7 @@ def error_of(dial: DrawnDial) -> tuple[float | None, float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DialResult:
-    """What came of one drawn dial: see `error_of`."""
+    """Result of one drawn dial; see `error_of`."""
 
     shape: str
     error: float | None
@@ -172,7 +172,7 @@ class DialResult:
 
 
 def read_drawn(seeds: range, draw: Callable[[int], DrawnDial] = draw_dial) -> list[DialResult]:
-    """The reader on every seed's dial."""
+    """Read the dials of all seeds."""
     results = []
     for seed in seeds:
         dial = draw(seed)
@@ -182,7 +182,7 @@ def read_drawn(seeds: range, draw: Callable[[int], DrawnDial] = draw_dial) -> li
 
 
 def summary(results: list[DialResult]) -> list[str]:
-    """Shares read within 2 %, refused, and wrong above 5 %, of all and of every shape of pointer."""
+    """Return the fractions within 2 %, refused, and wrong by more than 5 %, in total and per shape of pointer."""
     lines = []
     for group in ("all", *dict.fromkeys(sorted(r.shape for r in results))):
         errors = [r.error for r in results if group in ("all", r.shape)]
@@ -193,7 +193,7 @@ def summary(results: list[DialResult]) -> list[str]:
 
 
 def right_wrong_sure(results: list[DialResult]) -> tuple[int, int, int]:
-    """How many are within 2 %, how many are not, and how many of those claim 0.8 or more."""
+    """Return how many are within 2 %, how many are not, and how many of the latter have a confidence of 0.8 or more."""
     wrong = [r for r in results if r.error is not None and r.error > 2.0]
     right = sum(r.error is not None and r.error <= 2.0 for r in results)
     return right, len(wrong), sum(r.confidence >= 0.8 for r in wrong)

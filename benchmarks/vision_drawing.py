@@ -1,6 +1,6 @@
-"""Draws a panel file through a camera, in any state and with any disturbance: known truth for tests and axes.
+"""Draws a panel file as seen by a camera, in any state and with any disturbance, for tests with known truth.
 
-Flat shapes at their heights, painted from the plate upwards at four times the resolution; no shading model.
+Flat shapes at their heights are painted from the plate upwards at four times the resolution, without shading.
 """
 
 from __future__ import annotations
@@ -55,31 +55,31 @@ Shown = float | str
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Brush:
-    """Paints panel-frame shapes into an image through a view."""
+    """Paints shapes of the panel frame into an image by a projection."""
 
     image: NDArray[np.float32]
     view: PanelProjection
 
     def fill(self, points_m: ArrayLike, gray: float) -> None:
-        """A filled polygon of (N, 3) panel points."""
+        """Fill a polygon of (N, 3) panel points."""
         px = (self.view.project(points_m) + 0.5) * SUPERSAMPLING - 0.5
         if np.isfinite(px).all():
             cv2.fillPoly(self.image, [np.round(px * 16).astype(np.int32)], gray, shift=4)
 
     def disc(self, x: float, y: float, z: float, radius_m: float, gray: float) -> None:
-        """A filled circle parallel to the plate."""
+        """Fill a circle parallel to the plate."""
         a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
         self.fill(np.column_stack([x + radius_m * np.sin(a), y + radius_m * np.cos(a), np.full(60, z)]), gray)
 
     def box(self, x: float, y: float, z: float, size: tuple[float, float], gray: float, turn_rad: float = 0.0) -> None:
-        """A filled rectangle parallel to the plate, turned counter-clockwise."""
+        """Fill a rectangle parallel to the plate, rotated counter-clockwise."""
         w, h = size[0] / 2, size[1] / 2
         c, s = np.cos(turn_rad), np.sin(turn_rad)
         corners = np.array([[-w, h], [w, h], [w, -h], [-w, -h]]) @ np.array([[c, s], [-s, c]])
         self.fill(np.column_stack([corners + np.array([x, y]), np.full(4, z)]), gray)
 
     def bar(self, start: ArrayLike, end: ArrayLike, width_m: float, gray: float) -> None:
-        """A straight stroke between two (3,) points, its width parallel to the plate."""
+        """Draw a straight bar between two (3,) points, with its width parallel to the plate."""
         a, b = np.asarray(start, float), np.asarray(end, float)
         along = (b - a)[:2]
         n = np.array([-along[1], along[0], 0.0]) / max(float(np.linalg.norm(along)), 1e-9) * width_m / 2
@@ -88,7 +88,7 @@ class Brush:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disturbance:
-    """What stands between the panel and a clean image. Neutral by default."""
+    """Disturbances of an image; none by default."""
 
     exposure: float = 1.0
     slope_ratio: float = 1.0
@@ -107,7 +107,7 @@ def draw_panel(
     shown: Mapping[str, Shown],
     disturbance: Disturbance | None = None,
 ) -> NDArray[np.uint8]:
-    """Gray image (H, W) of the panel with every object showing `shown[name]`: a value, a state or a text."""
+    """Return a gray image (H, W) of the panel in which every object shows `shown[name]`: a value, a state or a text."""
     height, width = shape
     image = np.full((height * SUPERSAMPLING, width * SUPERSAMPLING), WALL, np.float32)
     brush = Brush(image=image, view=view)
@@ -121,7 +121,7 @@ def draw_panel(
 
 
 def disturbed(image: NDArray[np.float32], d: Disturbance) -> NDArray[np.uint8]:
-    """Light, lens, glare, cables, exposure and noise on a clean gray image."""
+    """Apply light, lens, glare, cables, exposure and noise to a clean gray image."""
     height, width = image.shape
     x = np.linspace(-1, 1, width)
     light = np.exp(0.5 * np.log(d.slope_ratio) * x)[None, :].astype(np.float32)
@@ -295,7 +295,7 @@ def looking_at(
     azimuth_rad: float = 0.0,
     target_m: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
-    """(4, 4) camera_from_panel of a camera `distance_m` before `target_m`, tilted off the plate's normal."""
+    """Return (4, 4) camera_from_panel of a camera `distance_m` from `target_m`, tilted from the plate's normal."""
     axis = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0.0])
     turn = cv2.Rodrigues(axis * tilt_rad)[0]
     frontal = np.diag([1.0, -1.0, -1.0])  # camera y is down and z goes into the plate
@@ -307,7 +307,7 @@ def looking_at(
 
 
 def camera(width_px: int = 640, height_px: int = 480, focal_px: float = 640.0) -> CameraIntrinsics:
-    """A wrist camera without lens errors."""
+    """Return the intrinsics of a wrist camera without distortion."""
     return CameraIntrinsics(
         width_px=width_px,
         height_px=height_px,

@@ -1,8 +1,9 @@
-"""Panels that nobody taught or tuned on: blind recognition and taught reading of drawn overviews, by class.
+"""Held-out panels: blind recognition and taught reading of drawn overviews not used for teaching or tuning, by class.
 
-`python -m benchmarks.vision_held_out [FIRST [COUNT [LEVEL]]]` names every reading of a level that is not right, too; also part
-of `benchmarks.vision`. The drawings follow the data's README (see `panel_scene`), not the files beside it: other proportions,
-letters, values and disturbances, so the shipped looks have not seen them. The readers were looked at on hard seeds 0 to 199.
+`python -m benchmarks.vision_held_out [FIRST [COUNT [LEVEL]]]` also lists every wrong reading of a level; the benchmark
+is part of `benchmarks.vision`. The drawings follow the data's README (see `panel_scene`) but differ from its files in
+proportions, letters, values and disturbances, so the shipped appearance data do not contain them. The hard seeds 0 to
+199 were used while developing the readers.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ PASS = {"pointer": (0.98, 0.95, 0.85), "display": (0.95, 0.90, 0.75), "state": (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """One readable object of a drawn panel and what was read: `error` in % of full scale, 100 for a wrong text or state."""
+    """Readable object of a drawn panel and its reading; `error` in % of full scale, 100 for a wrong text or state."""
 
     kind: str
     truth: str
@@ -40,12 +41,12 @@ class Judged:
 
     @property
     def is_right(self) -> bool:
-        """Within 2 % of full scale, or exactly."""
+        """Whether the value is within 2 % of full scale, or the state or text is exact."""
         return self.answered and self.error <= 2.0
 
 
 def read_scene(scene: Scene) -> list[Judged]:
-    """The readable objects of a scene, read as those of a taught panel."""
+    """Read the readable objects of a scene as those of a taught panel."""
     try:
         answers = {entry["id"]: entry for entry in taught_answer(scene.taught, scene.image)["objects"]}
     except CellError as error:
@@ -73,7 +74,7 @@ def _judged(panel_object: dict[str, Any], answer: dict[str, Any]) -> Judged:
 
 
 def found_blind(scene: Scene) -> tuple[int, int, int]:
-    """Objects found, objects given, and objects at least half visible, of a scene that is recognised blind."""
+    """Recognise a scene blind; return the numbers of objects found, of objects reported, and of those half visible."""
     there = [panel_object for panel_object in scene.truth["objects"] if panel_object["visible"] >= 0.5]
     hidden = [panel_object for panel_object in scene.truth["objects"] if panel_object["visible"] < 0.5]
     try:
@@ -94,7 +95,7 @@ def _is_near(entry: dict[str, Any], panel_object: dict[str, Any]) -> bool:
 
 
 def held_out_lines(first: int = FIRST, count: int = COUNT) -> list[str]:
-    """The issue's shares on drawn panels of all levels, a line each with its pass line."""
+    """Return the fractions on drawn panels of all levels, one line each with its pass line."""
     scenes = {level: [draw_scene(seed, level) for seed in range(first, first + count)] for level in LEVELS}
     rows = {level: [row for scene in drawn for row in read_scene(scene)] for level, drawn in scenes.items()}
     blind = {level: np.sum([found_blind(scene) for scene in drawn], axis=0) for level, drawn in scenes.items()}
@@ -123,7 +124,7 @@ def _sure_wrong(rows: Iterable[Judged]) -> float:
 
 
 def by_kind(rows: list[Judged]) -> list[str]:
-    """A line a kind: how many, right, wrong, sure and wrong; then a line a reading that is not right."""
+    """Return one line per kind (count, right, wrong, confidently wrong), then one line per wrong reading."""
     lines = []
     for kind in sorted({row.kind for row in rows}):
         of_kind = [row for row in rows if row.kind == kind]
@@ -140,7 +141,7 @@ def by_kind(rows: list[Judged]) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Entry point; returns the exit status."""
+    """Run the command line; return the exit status."""
     cv2.setNumThreads(1)
     first, count = int(arguments[0]) if arguments else FIRST, int(arguments[1]) if len(arguments) > 1 else COUNT
     if len(arguments) > 2:

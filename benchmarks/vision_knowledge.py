@@ -34,21 +34,21 @@ from perception.vision.teaching.condense import worth_keeping
 
 DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "vision" / "synth_dev"
 FOLDS = 3
-LEVELS = 3  # come in turn in the folder: folds of every third overview would each hold out one level entirely
-ELSEWHERE_PX = 7.0  # a place further from every object's middle is none
-STEP = 0.01  # looks are written with two decimals
+LEVELS = 3  # alternate in the folder, so folds of every third overview would hold out one level entirely
+ELSEWHERE_PX = 7.0  # a place further than this from the centre of every object is not an object
+STEP = 0.01  # looks are stored with two decimals
 NO_SIZE_M = (0.01, 0.01)
-SLIDER_M = (0.05, 0.05)  # flat and upright ones share a kind
+SLIDER_M = (0.05, 0.05)  # horizontal and vertical sliders are one kind
 BINS = 8
 BAD_LIGHT = "hard"
-COPIES = 3  # in bad light, of every overview in good light
-COPIES_OF_NOTHING = 2  # that also teach what is no object: the third adds size and no recall
-NOTHING_MARGIN = 0.015  # of their looks; twice as many are of nothing as of objects
+COPIES = 3  # drawn in bad light, of every overview in good light
+COPIES_OF_NOTHING = 2  # copies that also teach places without object; a third adds size but no recall
+NOTHING_MARGIN = 0.015  # margin for looks in bad light; twice as many are of nothing as of objects
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Examples:
-    """What one picture of an overview teaches: its objects with their middles and looks, and candidate places with theirs."""
+    """Examples in one image of an overview: objects with their centres and looks, and candidate places with looks."""
 
     truth: list[dict[str, Any]]
     places: Array
@@ -59,7 +59,7 @@ class Examples:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lesson(Examples):
-    """One overview: its rectified plate too, and `worse`: what it would teach in bad light."""
+    """Examples of one overview with its rectified plate; `worse` are the examples that it would give in bad light."""
 
     level: str
     view: PlateProjection
@@ -68,7 +68,7 @@ class Lesson(Examples):
 
 
 def lessons(folder: Path) -> Iterator[Lesson]:
-    """The overviews of a folder in which the plate is found."""
+    """Yield the overviews of a folder in which the plate is found."""
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     for name, entry in truth.items():
         read = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) if entry["kind"] == "overview" else None
@@ -85,7 +85,7 @@ def lessons(folder: Path) -> Iterator[Lesson]:
 
 
 def _seen_there(ground: Ground, view: PlateProjection, truth: list[dict[str, Any]]) -> dict[str, Any]:
-    """The fields of `Examples`."""
+    """Return the fields of `Examples`."""
     pixels = np.array([[*panel_object["center_px"], 1.0] for panel_object in truth])
     on_plate = pixels @ np.linalg.inv(view.px_from_plate).T
     xy = on_plate[:, :2] / on_plate[:, 2:]
@@ -96,8 +96,8 @@ def _seen_there(ground: Ground, view: PlateProjection, truth: list[dict[str, Any
 
 
 def _worse(gray: Image, view: PlateProjection, entry: dict[str, Any], copy: int) -> Examples:
-    """The overview as it would be in bad light, and what of its objects would be seen then."""
-    random = np.random.default_rng((copy, *gray.tobytes()[:: gray.size // 8]))  # other light for every overview
+    """Return the examples of the overview as it would look in bad light, with the visibility of its objects."""
+    random = np.random.default_rng((copy, *gray.tobytes()[:: gray.size // 8]))  # different light per overview
     light = (gray.astype(float) / 255) ** GAMMA
     image, cover, bright = pictured(random, light, AMOUNTS[BAD_LIGHT], (gray.shape[1], gray.shape[0]))
     px_from_mm = np.array(entry["H_mm_to_px"])
@@ -108,7 +108,7 @@ def _worse(gray: Image, view: PlateProjection, entry: dict[str, Any], copy: int)
 
 
 def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
-    """Condensed looks of every kind, and of nothing; then those of bad light that these do not tell."""
+    """Return condensed looks of all kinds and of nothing, and looks in bad light that these do not recognise."""
     looks, names = _examples(taught)
     kinds = [
         TaughtKind(
@@ -123,7 +123,7 @@ def knowledge_of(taught: Sequence[Lesson]) -> Knowledge:
 
 
 def with_noisy(known: Knowledge, taught: Sequence[Lesson]) -> Knowledge:
-    """The knowledge with looks in bad light that it does not tell yet."""
+    """Return the knowledge extended by looks in bad light that it does not recognise yet."""
     worse = [
         each if k < COPIES_OF_NOTHING else replace(each, places=each.places[:0], looks=each.looks[:0])
         for lesson in taught
@@ -141,7 +141,7 @@ def with_noisy(known: Knowledge, taught: Sequence[Lesson]) -> Knowledge:
 
 
 def _examples(taught: Sequence[Examples]) -> tuple[Array, NDArray[np.str_]]:
-    """(N, LENGTH) looks and (N,) kinds of everything that is at least half visible, and of what is no object."""
+    """Return (N, LENGTH) looks and (N,) kinds of all objects that are at least half visible, and of other places."""
     looks, names = [], []
     for lesson in taught:
         for panel_object, look in zip(lesson.truth, lesson.object_looks, strict=True):
@@ -163,14 +163,14 @@ def _size_m(taught: Sequence[Lesson], name: str) -> tuple[float, float]:
 
 
 def judged(lesson: Lesson, knowledge: Knowledge) -> tuple[list[tuple[float, bool]], int]:
-    """(confidence, right) of every accepted candidate, and how many objects are at least half visible."""
+    """Return (confidence, right) of every accepted candidate, and how many objects are at least half visible."""
     found = chosen(lesson.ground, lesson.places, lesson.looks, knowledge, lesson.view, PLATE_M)
     rows = [(c.confidence, right) for c in found if c.reason is None and (right := _right(lesson, c)) is not None]
     return rows, sum(panel_object["visible"] >= 0.5 for panel_object in lesson.truth)
 
 
 def _right(lesson: Lesson, candidate: Detection) -> bool | None:
-    """Whether the nearest object is of that kind and near enough; None for one that is hidden for the most part."""
+    """Return whether the nearest object is of that kind and near enough; None if most of it is hidden."""
     off = [float(np.linalg.norm(candidate.centre_px - panel_object["center_px"])) for panel_object in lesson.truth]
     panel_object = lesson.truth[int(np.argmin(off))]
     near = min(off) < 0.5 * max(panel_object["bbox_px"][2:])
@@ -199,7 +199,7 @@ def _print_folds(all_lessons: Sequence[Lesson]) -> None:
 
 
 def main() -> int:
-    """Print what held-out overviews say, and write what all of them teach."""
+    """Print the results of held-out overviews, and write what all overviews teach."""
     only_noisy = sys.argv[2:] == ["--only-noisy"]
     if len(sys.argv) != 2 + only_noisy or not DATA.exists():
         print(__doc__ if DATA.exists() else "no labelled overviews beside the repository")

@@ -1,8 +1,8 @@
-"""Drawn photographs of pressure gauges with known readings: double scales, bands, screws, words, shadows, reflections.
+"""Draws photographs of pressure gauges with known readings: double scales, bands, screws, words, shadows, reflections.
 
-Three quarters of a turn unless told otherwise, a dark or red pointer with a counterweight, a bezel, and something around
-it. Nothing of the pointer is fitted to them; where ticks end was tried on
-seeds 70000 to 70320, 71000 to 71099 and 84000 to 84199.
+By default the scale spans three quarters of a turn; the pointer is dark or red with a counterweight, and there is a
+bezel with something around it. The search for the pointer was not tuned on them; the search for the ends of ticks was
+tested on seeds 70000 to 70320, 71000 to 71099 and 84000 to 84199.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ WORDS = ("bar", "psi", "kPa", "kg/cm2", "MPa", "PRESSURE", "CL 1.6", "EN 837-1")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
-    """What a pointer sweeps: how far, and by how much the whole gauge is turned clockwise."""
+    """Sweep of a pointer: its angle, and the clockwise rotation of the whole gauge."""
 
     span_rad: float = SPAN_RAD
     turned_rad: float = 0.0
 
     def angle_rad(self, share: float) -> float:
-        """Where a share of the scale stands, clockwise from up."""
+        """Return the angle of a fraction of the scale, clockwise from up."""
         return (share - 0.5) * self.span_rad + self.turned_rad
 
 
@@ -48,7 +48,7 @@ UNUSUAL = {
 
 
 def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
-    """A pressure gauge of a look of its own, its reading from 0 to 10; the same for the same seed."""
+    """Draw a pressure gauge of random design with a reading from 0 to 10, the same for the same seed."""
     rng = np.random.default_rng(seed)
     share = float(rng.uniform(0.0, 0.98))
     angle = way.angle_rad(share)
@@ -61,7 +61,7 @@ def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
 
 
 def _mounted(rng: Rng) -> Pen:
-    """A pen on a bezel, before pipes and plates."""
+    """Draw a bezel in front of pipes and plates, and return the pen for the face."""
     canvas = np.full((CANVAS_PX, CANVAS_PX, 3), rng.integers(20, 230, 3), np.uint8)
     for _ in range(int(rng.integers(0, 7))):
         a, b = rng.integers(-100, CANVAS_PX + 100, (2, 2))
@@ -74,7 +74,7 @@ def _mounted(rng: Rng) -> Pen:
     outer = float(rng.uniform(0.36, 0.48)) * CANVAS_PX
     pen = Pen(canvas=canvas, middle=middle, radius=outer * float(rng.uniform(0.82, 0.95)))
     dark, light = sorted(int(v) for v in rng.integers(20, 215, 2))
-    for k in range(12):  # a turned ring: its gray changes inwards
+    for k in range(12):  # a turned metal ring, whose gray changes inwards
         gray = round(dark + (light - dark) * abs(np.sin(k / 11 * np.pi)))
         pen.disc(0.0, (0.0, 0.0), (outer + (pen.radius - outer) * k / 12) / pen.radius, (gray, gray, gray))
     return pen
@@ -118,7 +118,7 @@ def _face(pen: Pen, rng: Rng, way: Way) -> None:
 
 
 def _ring(pen: Pen, rng: Rng, way: Way, full: float, steps: int, outer: float, ink: Colour) -> None:
-    """A scale of ticks that end at `outer`, with its numerals inside."""
+    """Draw a scale of ticks that end at the radius `outer`, with numerals inside."""
     minor, size = int(rng.choice((2, 4, 5, 10))), float(rng.uniform(0.0014, 0.0024))
     for k in range(steps * minor + 1):
         turn = way.angle_rad(k / (steps * minor))
@@ -180,7 +180,7 @@ def _one_pointer(pen: Pen, shape: str, angle: float, reach: float, tail: float, 
 
 
 def _photographed(pen: Pen, rng: Rng) -> Image:
-    """The canvas through glass, a little aslant, light, lens, noise and JPEG."""
+    """Return the canvas behind glass, seen slightly at an angle, after light, lens, noise and JPEG."""
     canvas = pen.canvas.astype(np.float32)
     if rng.random() < 0.5:
         canvas = _reflected(canvas, pen, rng)
@@ -200,7 +200,7 @@ def _photographed(pen: Pen, rng: Rng) -> Image:
 
 
 def _reflected(canvas: NDArray[np.float32], pen: Pen, rng: Rng) -> NDArray[np.float32]:
-    """A window or a lamp in the glass over the face."""
+    """Add the reflection of a window or a lamp in the glass over the face."""
     y, x = np.mgrid[:CANVAS_PX, :CANVAS_PX].astype(np.float32)
     turn, at = rng.uniform(0, np.pi), rng.normal(0.0, 0.4, 2) * pen.radius
     along = (x - pen.middle[0] - at[0]) * np.cos(turn) + (y - pen.middle[1] - at[1]) * np.sin(turn)

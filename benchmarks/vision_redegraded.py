@@ -1,9 +1,10 @@
-"""The development images in good light, taken again in bad light: taught readings of that drawing style, many times over.
+"""Taught readings of the development images in good light, degraded again as in bad light, with many seeds.
 
-`python -m benchmarks.vision_redegraded [FIRST [COUNT [LEVEL]]]`: every easy overview and close-up of 640x480 is laid anew by a
-tilted camera and meets the light, cables, blur and noise of a level (`panel_scene.pictured`: shapes, order and amounts are
-those of the hard development images). The files have 18 hard displays; every seed gives as many again. The figures of the
-level's own images are printed beside, to tell whether these are like them. Seeds 0 to 11 and 100 to 115 were looked at.
+`python -m benchmarks.vision_redegraded [FIRST [COUNT [LEVEL]]]`: every easy overview and close-up of 640x480 is warped
+to the view of a tilted camera and degraded by the light, cables, blur and noise of a level (`panel_scene.pictured`;
+shapes, order and amounts are those of the hard development images). The files contain 18 hard displays, and every seed
+adds as many. The figures of the level's own images are printed for comparison. Seeds 0 to 11 and 100 to 115 were used
+in development.
 """
 
 from __future__ import annotations
@@ -26,30 +27,30 @@ from hal.arrays import Array
 from perception.vision.image import as_gray, decode
 
 FIRST, COUNT, LEVEL = 1000, 3, "hard"
-OWN_BLUR_PX = 0.36  # of an easy image, which the new blur adds to (squares add)
+OWN_BLUR_PX = 0.36  # blur of an easy image; the new blur adds to it in quadrature
 SHOWN = ("gauge", "panel_meter", "display", "toggle", "rotary", "button", "lamp", "lever", "slider", "handwheel")
 
 
 def development_truth() -> dict[str, Any]:
-    """The truth of the development overviews and close-ups, by file name."""
+    """Return the truth of the development overviews and close-ups, by file name."""
     truth = json.loads((DATA / "synth_dev" / "truth.json").read_text(encoding="utf-8"))
     return {name: t for name, t in truth.items() if t["kind"] in ("overview", "close") and "lights_on" not in t}
 
 
 def development_scene(name: str, truth: dict[str, Any]) -> Scene:
-    """A development image as it is."""
+    """Return a development image without changes."""
     return Scene(image=decode((DATA / "synth_dev" / name).read_bytes()), truth=truth, taught=_taught_job(name, truth))
 
 
 def redegraded(name: str, truth: dict[str, Any], seed: int, level: str) -> Scene:
-    """A development image in good light, taken again by another camera in the light of a level."""
+    """Return a development image in good light as another camera would see it in the light of a level."""
     random = np.random.default_rng((seed, LEVELS.index(level), *name.encode()))
     image = as_gray(decode((DATA / "synth_dev" / name).read_bytes()))
     height, width = image.shape
     amount = _sharper(AMOUNTS[level])
     old_from_mm = np.array(truth["H_mm_to_px"])
     new_from_mm = _placed(random, old_from_mm, (width, height), truth["px_per_mm"], amount.tilt_rad)
-    k = 2  # drawn twice as large as it is taken; pixel centres lie at halves
+    k = 2  # drawn at twice the final resolution; pixel centres are at half-integers
     grow = np.array([[k, 0, (k - 1) / 2], [0, k, (k - 1) / 2], [0, 0, 1.0]])
     new_from_old = grow @ new_from_mm @ np.linalg.inv(old_from_mm)
     light = (np.asarray(image, np.float32) / 255) ** GAMMA
@@ -69,7 +70,7 @@ def redegraded(name: str, truth: dict[str, Any], seed: int, level: str) -> Scene
 
 
 def _sharper(amount: Level) -> Level:
-    """The amounts with what an easy image is blurred by already taken off."""
+    """Return the amounts with the blur reduced by that of an easy image."""
     least, most = (float(np.sqrt(max(b**2 - OWN_BLUR_PX**2, 0.01))) for b in amount.blur_px)
     return replace(amount, blur_px=(least, most))
 
@@ -77,7 +78,7 @@ def _sharper(amount: Level) -> Level:
 def _placed(
     random: np.random.Generator, old_from_mm: Array, size_px: tuple[int, int], px_per_mm: float, most_rad: float
 ) -> Array:
-    """(3, 3) pixels from panel millimetres: a camera before what the old one looked at, tilted and turned."""
+    """Return the (3, 3) homography from panel millimetres to pixels of a tilted camera with the old view centre."""
     middle_px = np.array([size_px[0] / 2, size_px[1] / 2, 1.0])
     x, y, w = np.linalg.solve(old_from_mm, middle_px)
     lean, tilt = random.uniform(0, 2 * np.pi), most_rad * np.sqrt(random.uniform(0.1, 1.0))
@@ -91,13 +92,13 @@ def _placed(
 
 
 def _taught_job(name: str, truth: dict[str, Any]) -> dict[str, Any]:
-    """The job that the data's own script makes of an image."""
+    """Return the job that the script of the data makes for an image."""
     jobs = module_of(DATA / "make_inputs.py").jobs({name: truth})
     return next(job for job in jobs if job["mode"] == "taught")
 
 
 def scenes(first: int, count: int, level: str) -> Iterator[Scene]:
-    """Every easy 640x480 image in the light of a level, `count` times."""
+    """Yield every easy 640x480 image in the light of a level, `count` times."""
     easy = {n: t for n, t in development_truth().items() if t["level"] == "easy" and t["width"] == 640}
     for seed in range(first, first + count):
         for name, truth in easy.items():
@@ -105,7 +106,7 @@ def scenes(first: int, count: int, level: str) -> Iterator[Scene]:
 
 
 def table(rows: list[Judged]) -> list[str]:
-    """A line a kind: how many, right, refused, wrong, wrong at .8 or more; then all, and after refusing 5 % more."""
+    """Return a line per kind: count, right, refused, wrong, wrong at 0.8 or more; then all, and 5 % more refused."""
     lines = [f"  {'':12s} {'n':>5s} {'right':>6s} {'refused':>8s} {'wrong':>6s} {'sure and wrong':>15s}"]
     for kind in (*SHOWN, "all"):
         of_kind = [row for row in rows if kind in (row.kind, "all")]
@@ -124,7 +125,7 @@ def table(rows: list[Judged]) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Entry point; returns the exit status."""
+    """Run the command line; return the exit status."""
     cv2.setNumThreads(1)
     first, count = int(arguments[0]) if arguments else FIRST, int(arguments[1]) if len(arguments) > 1 else COUNT
     level = arguments[2] if len(arguments) > 2 else LEVEL

@@ -1,4 +1,4 @@
-"""Is a confidence what it says? Readings by their confidence against the share that is right, as a table and a picture."""
+"""Reliability of confidences: the fraction of right readings by confidence, as a table and a diagram."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ INK, GRID, BAR = (40, 40, 40), (215, 215, 215), (170, 120, 60)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """One answered reading: its confidence, and whether it was right (state and text exact, value within 2 % of scale)."""
+    """Answered reading: its confidence, and whether it is right (state or text exact, value within 2 % of scale)."""
 
     confidence: float
     right: bool
@@ -26,7 +26,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bin:
-    """Answers between two confidences: how many, their mean confidence, and the share right with one sigma of it."""
+    """Answers between two confidences: count, mean confidence, and fraction right with its standard deviation."""
 
     low: float
     high: float
@@ -37,9 +37,9 @@ class Bin:
 
 
 def reliability(answers: Sequence[Answer], edges: Sequence[float] = EDGES) -> tuple[list[Bin], float]:
-    """Bins that hold something, and the expected calibration error: mean |confidence - share right| over the answers.
+    """Return the non-empty bins and the expected calibration error, the mean |confidence - fraction right|.
 
-    The sigma is Wilson's at one standard deviation, so that a bin of one is no certainty (JASA 22, 1927).
+    The standard deviation is Wilson's (JASA 22, 1927), so that it is not zero for a bin with one answer.
     """
     c = np.array([a.confidence for a in answers])
     right = np.array([a.right for a in answers], float)
@@ -57,7 +57,7 @@ def reliability(answers: Sequence[Answer], edges: Sequence[float] = EDGES) -> tu
 
 
 def reliability_lines(what: str, answers: Sequence[Answer]) -> list[str]:
-    """The diagram as text: a line a bin."""
+    """Return the diagram as text, one line per bin."""
     bins, error = reliability(answers)
     lines = [f"\nreliability of confidences, {what}: {len(answers)} answers, expected calibration error {error:.3f}"]
     lines += [
@@ -69,7 +69,7 @@ def reliability_lines(what: str, answers: Sequence[Answer]) -> list[str]:
 
 
 def draw_reliability(answers: Sequence[Answer], path: Path) -> None:
-    """Writes the diagram as PNG: a bar a bin, its sigma, the count above it, and the diagonal of honest confidences."""
+    """Write the diagram as PNG: a bar per bin, its sigma and count, and the diagonal of correct confidences."""
     size = SIDE_PX + 2 * MARGIN_PX
     picture = np.full((size, size, 3), 255, np.uint8)
     for tick in np.linspace(0.5, 1.0, 6):

@@ -1,4 +1,4 @@
-"""The issue's vision table, measured on the development images beside its pass lines, and the robustness axes."""
+"""Prints the vision table, measured on the development images beside its pass lines, and the robustness axes."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ STATES = ("toggle", "rotary", "button", "lamp", "lever")
 POINTERS = ("gauge", "panel_meter")
 ROOT = Path(__file__).resolve().parent.parent
 DRAWN_DIALS = range(200)
-FEW_GAUGES = range(86000, 86050)  # read once when all was icm_labels
+FEW_GAUGES = range(86000, 86050)  # seeds that were not used in development
 READINGS_TIMED = 40
 
 
 def report(data: Path) -> int:
-    """Print everything; 1 if the development images are not there."""
+    """Print everything; return 1 if the development images do not exist."""
     answers: list[Answer] = []
     if not data.exists():
         print(f"no development images at {data.name}: only the axes can be measured")
@@ -83,7 +83,7 @@ def report(data: Path) -> int:
 
 
 def module_of(path: Path) -> ModuleType:
-    """A script of the data folder, loaded by its path."""
+    """Load a script of the data folder by its path."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
         raise FileNotFoundError(path)
@@ -105,7 +105,7 @@ def _line(what: str, measured: list[float], passes: tuple[float, ...], *, at_mos
 
 
 def _table(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> list[dict[str, Any]]:
-    """Prints the issue's lines; returns the rows of the taught readings."""
+    """Print the lines of the table; return the rows of the taught readings."""
     print("\nmeasured on the development images, easy / medium / hard; blind knowledge was taught on these images")
     blind = {n: t for n, t in truth.items() if t["kind"] == "overview" and "lights_on" not in t}
     result = score.score_panels(blind, {n: answers.get(f"{Path(n).stem}/blind", {}) for n in blind})
@@ -147,9 +147,9 @@ def _table(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) ->
 
 
 def _taught_rows(truth: dict[str, Any], answers: dict[str, Any], score: ModuleType) -> list[dict[str, Any]]:
-    """One row a readable object: error in % of full scale, 0 or 100 for texts and states; a refusal counts as 100.
+    """Return a row per readable object: error in % of full scale, 0 or 100 for texts and states; 100 for a refusal.
 
-    `likeliest_is_right`: of a refused display, which stays refused.
+    `likeliest_is_right` tells whether the most likely number of a refused display is right; it stays refused.
     """
     rows = []
     for name, t in truth.items():
@@ -183,12 +183,12 @@ def _taught_rows(truth: dict[str, Any], answers: dict[str, Any], score: ModuleTy
 
 
 def guess_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """The taught lines for a caller who wants the best guess of everything: right, beside what the confidences expect.
+    """Return the lines for a caller who wants best guesses: fractions right beside those expected from the confidences.
 
-    Readings that turn out right far more or less often than expected were lucky or unlucky, or say too little or too much.
+    Readings that are right far more or less often than expected have wrong confidences, or it is chance.
 
     Args:
-        rows: as `_taught_rows` gives them; what is refused nevertheless counts as wrong, and is the first to be left out.
+        rows: from `_taught_rows`; refused readings count as wrong and are left out first.
     """
     lines = ["the same for least_confidence=0 (best guesses), right beside what their own confidences expect"]
     for what, kinds in (
@@ -208,7 +208,7 @@ def guess_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _claimed(row: dict[str, Any]) -> float:
-    """How probably a row is right by its own confidence."""
+    """Return the probability that a row is right, by its own confidence."""
     return float(row["confidence"]) if row["answered"] else 0.0
 
 
@@ -234,7 +234,7 @@ def _speed(folder: Path) -> None:
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=0.62)))
     view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     image = draw_panel(panel, view, (960, 1280), random_state(panel, 0))
-    # A reading takes a moment, so that a busy machine may disturb a few in a row, but not each of many.
+    # A reading is short, so a busy machine may disturb some consecutive ones, but not all of many.
     readings = [
         _best([partial(_read_one, image, view, panel_object)], READINGS_TIMED) for panel_object in panel.objects
     ]
@@ -249,7 +249,7 @@ def _read_one(image: Image, view: CameraProjection, panel_object: PanelObject) -
 
 
 def _best(tasks: list[Callable[[], object]], repeats: int) -> float:
-    """Median over the tasks of each one's best processor time, s: what a busy machine adds is left out."""
+    """Return the median over the tasks of the shortest CPU time of each, s, which a busy machine hardly changes."""
     best = []
     for task in tasks:
         task()

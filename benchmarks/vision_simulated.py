@@ -35,7 +35,7 @@ BLIND = {"mode": "blind"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """One accepted candidate: what it was taken for, how surely, the object that is there (None: none), and how far off."""
+    """Accepted candidate: its kind, its confidence, the object that is there (None if none), and its distance."""
 
     kind: str
     confidence: float
@@ -46,7 +46,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overview:
-    """One blind overview, judged."""
+    """One blind overview with its judged candidates."""
 
     answers: tuple[Answer, ...]
     missed: tuple[str, ...]
@@ -54,7 +54,7 @@ class Overview:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Judge, or teach."""
+    """Judge or teach."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("first", type=int, nargs="?", default=FIRST)
     parser.add_argument("last", type=int, nargs="?", default=LAST)
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def look(cell: Cell, seed: int) -> list[Overview]:
-    """The blind overviews of a seed: before the panel is located, and after."""
+    """Return the blind overviews of a seed before and after the panel is located."""
     with tempfile.TemporaryDirectory() as folder, running(cell, Path(folder)) as client:
         before = run_to_end(client, "/v1/recognise", BLIND)["result"]["candidates"]
         run_to_end(client, "/v1/panel-pose", {})
@@ -84,7 +84,7 @@ def look(cell: Cell, seed: int) -> list[Overview]:
 
 
 def judged(cell: Cell, seed: int, candidates: Sequence[dict[str, Any]]) -> Overview:
-    """Candidates against where the simulator built the objects: right in kind, and within half of the larger side."""
+    """Compare candidates with the simulator's objects: the kind must be right, and the distance within half a side."""
     built = {each.panel_object.name: each for each in build(cell.panel, Draws(seed))}
     places = {name: np.add(each.panel_object.position_m, each.offset_m) for name, each in built.items()}
     answers, found = [], set()
@@ -112,7 +112,7 @@ def judged(cell: Cell, seed: int, candidates: Sequence[dict[str, Any]]) -> Overv
 
 
 def lines(seen: Sequence[Overview]) -> list[str]:
-    """Recall, precision, reliability, and what was missed or taken for something else."""
+    """Return recall, precision, reliability, and which kinds were missed or confused."""
     answers = [answer for overview in seen for answer in overview.answers]
     objects = sum(overview.objects for overview in seen)
     recall = 1.0 - sum(len(overview.missed) for overview in seen) / objects
@@ -141,7 +141,7 @@ def teach(cell_path: Path, seeds: Sequence[int], folder: Path) -> None:
                 for body in (
                     {"move": False},
                     {"move": True},
-                ):  # as far off as an unknown panel is looked at, and nearer
+                ):  # from the distance for an unknown panel, then from nearer
                     learned = run_to_end(client, "/v1/learn", body)["result"]
                     print(f"seed {seed}: {sum(learned['added'].values())} looks; left out: {learned['left_out']}")
         taught, shipped = load_knowledge(Path(runs) / "knowledge"), load_knowledge()
@@ -153,14 +153,14 @@ def teach(cell_path: Path, seeds: Sequence[int], folder: Path) -> None:
 
 
 def without_looks(cell: Cell) -> Cell:
-    """The cell with nothing but the shipped looks."""
+    """Return the cell with the shipped looks only."""
     section = cell.file.cell.model_copy(update={"knowledge": None})
     return cell.model_copy(update={"file": cell.file.model_copy(update={"cell": section})})
 
 
 @contextmanager
 def running(cell: Cell, runs: Path) -> Iterator[Client]:
-    """A client of the cell's own service."""
+    """Yield a client of a service that runs the cell."""
     panelwright = Panelwright(cell, Options(port=0, runs_dir=runs))
     panelwright.start()
     try:

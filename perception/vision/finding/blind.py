@@ -1,8 +1,8 @@
-"""Recognition of objects in an overview when only the kinds and the plate's size are known.
+"""Recognition of objects in an overview if only the kinds and the plate's size are known.
 
 Bottom-up as in the paper: first the plate, then sub-objects (circles, rectangles, slots, closed groups of edges), whose
-middles are the candidates. The features of every candidate are compared with the taught features of all kinds and of
-"nothing". The most likely candidates that do not overlap a more likely one are accepted.
+middles are the candidates. The features of every candidate (its look) are compared with the taught features of all
+kinds and of "nothing". The most likely candidates that do not overlap a more likely one are accepted.
 """
 
 from __future__ import annotations
@@ -31,18 +31,21 @@ from perception.vision.projection import PanelProjection
 from perception.vision.reading import ANSWER_AT
 
 PLATE_M = (0.40, 0.30)
-ROWS_APART = 3  # of those that tell the noise: enough, and a millisecond saved
-NOISY = 2.4  # gray levels; overviews drawn at medium have 2.2 at most, hard ones 2.5 at least
-UPSIDE_DOWN = 0.15  # see `uprightness`
-SURE, LEAST_SURE = 0.95, 4  # so many objects confirm a plate; of close-ups and turned panels taken for one 3 at most
-FURTHEST = 0.8  # a place further from every look is unlike anything taught
-SECOND_LOOK = 0.05  # a candidate this much liker to nothing still gets a look from its best middle
-# Confidence = logistic((lead - EVEN) / SCALE), lead = how much nearer the kind is than what is next. Logistic regression
-# gives 0.018 and 0.021 over overviews that the looks had not been taught on (benchmarks/vision_knowledge prints the
-# reliability), and 0.029 and 0.018 over drawings by another hand: between them, nearer to those, as precision is dearer.
+ROWS_APART = 3  # rows used for the noise estimate; enough, and a millisecond faster
+NOISY = 2.4  # gray levels; of synthetic overviews those of medium difficulty have 2.2 at most, hard ones 2.5 at least
+UPSIDE_DOWN = 0.15  # a panel is refused if its `uprightness` is below minus this
+# So many objects so certain confirm a plate; close-ups and rotated panels that resemble a plate have 3 at most.
+SURE, LEAST_SURE = 0.95, 4
+FURTHEST = 0.8  # a place with a larger distance from every look is unlike anything taught
+SECOND_LOOK = 0.05  # a candidate nearer to "nothing" by up to this is compared again at its best middle
+# Confidence = logistic((lead - EVEN) / SCALE), where the lead is how much nearer the kind is than the next one.
+# Logistic regression gives 0.018 and 0.021 over overviews that were not used for teaching (benchmarks/vision_knowledge
+# prints the reliability), and 0.029 and 0.018 over drawings by another author. The values lie between these, nearer to
+# the latter, because wrong answers are worse than refusals.
 EVEN, SCALE = 0.026, 0.020
-# In a noisy image two kinds' single nearest looks are too often nearest by chance: the mean of this many decides. Held-out
-# overviews drawn in hard light give 0.005, drawings by another hand 0.010, and 0.020 and 0.018 for the scale.
+# In a noisy image a single look is too often nearest by chance, so the mean distance of several looks decides.
+# Overviews in hard light that were not used for teaching give 0.005 for NOISY_EVEN, drawings by another author 0.010;
+# the scales are 0.020 and 0.018.
 NOISY_MEAN_OF = 3
 NOISY_EVEN = 0.014
 CROSS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -54,16 +57,17 @@ SLOT_M = (0.034, 0.085)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Detection:
-    """A place where an object may be.
+    """A place where there may be an object.
 
     Attributes:
-        kind: the likest kind.
+        kind: the most likely kind.
         confidence: 0 to 1.
         centre_px, centre_m: (2,) middle in the image, and on the plate (origin in its middle, y up).
-        place_m: (2,) the place on the plate that looks so: `centre_m`, or a part of the object that shows better.
-        box_px: (4, 2) a typical object's outline there.
-        distance: to the likest look; `rival`: the next kind and its distance.
-        reason: why it is refused; None for an object.
+        place_m: (2,) place on the plate with the look of the kind: `centre_m`, or a more distinct part of the object.
+        box_px: (4, 2) outline of a typical object there.
+        distance: to the nearest look of that kind.
+        rival: the next kind and its distance.
+        reason: why the candidate is refused; None for an object.
     """
 
     kind: str
@@ -85,13 +89,13 @@ def recognise(
     view: PanelProjection | None = None,
     focal_px: float | None = None,
 ) -> tuple[Detection, ...]:
-    """Objects of known kinds, best first; then the refused candidates with their reasons.
+    """Find objects of known kinds, best first; then the refused candidates with their reasons.
 
     Args:
         image: overview, gray or RGB uint8; the plate fills most of it.
         plate_m: width and height of the plate.
-        view: where the plate is, if that is known; else its border is looked for.
-        focal_px: of the camera, if known; completes a plate that the image cuts off.
+        view: projection of the plate, if known; else its border is searched.
+        focal_px: of the camera, if known; helps to complete a plate that the image cuts off.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
@@ -122,12 +126,13 @@ def recognise(
 def uprightness(
     ground: Ground, found: Sequence[Detection], knowledge: Knowledge, plate_m: tuple[float, float]
 ) -> float:
-    """Evidence that the panel is upright: the accepted objects' total likeness as they are minus that turned by half a turn.
+    """Return the evidence that the panel is upright, summed over the accepted objects.
 
-    Labels stand below, pivots of meters lie low, and light comes from above: one object alone may say little, a panel
-    says much. The features for images of normal noise are used with full weights, because those far from a middle
-    discriminate best. Of 47 overviews that were not used for teaching the least value upright is 0.14; turned ones are
-    below -0.2, except a hard one (-0.01).
+    It is the distance of each object's features from its kind when rotated by half a turn, minus the distance as it is.
+    Labels stand below, pivots of meters lie low, and light comes from above, so a whole panel is conclusive even if a
+    single object is not. The features for images of normal noise are used with full weights, because those far from a
+    middle discriminate best. Of 47 overviews that were not used for teaching the least value upright is 0.14; rotated
+    ones are below -0.2, except a hard one (-0.01).
     """
     knowledge = knowledge.for_image(noisy=False)
     names = [kind.name for kind in knowledge.kinds]
@@ -146,7 +151,7 @@ def uprightness(
 
 
 def lay_out(gray: Image, view: PanelProjection, plate_m: tuple[float, float]) -> Ground:
-    """The plate rectified to a frontal view, with cables removed, and its edges."""
+    """Rectify the plate to a frontal view, remove cables, and find its edges."""
     w, h = plate_m
     size = (round(w * PLATE_PX_PER_M), round(h * PLATE_PX_PER_M))
     corners = np.array([[-w / 2, h / 2, 0], [w / 2, h / 2, 0], [w / 2, -h / 2, 0], [-w / 2, -h / 2, 0]])
@@ -164,7 +169,7 @@ def lay_out(gray: Image, view: PanelProjection, plate_m: tuple[float, float]) ->
 
 
 def candidate_places(edges: Edges) -> Array:
-    """(N, 2) middles of sub-objects on the rectified plate, px."""
+    """Return the middles (N, 2) of sub-objects on the rectified plate, px."""
     s = PLATE_PX_PER_M
     maps = direction_maps(edges)
     places = [(c.u, c.v) for c in find_circles(edges, least_px=CIRCLE_RADII_M[0] * s, most_px=CIRCLE_RADII_M[1] * s)]
@@ -183,7 +188,7 @@ def candidate_places(edges: Edges) -> Array:
 
 
 def _groups(edges: Edges) -> list[tuple[float, float]]:
-    """Middles of the boxes round groups of neighbouring edges, at two grouping distances."""
+    """Return the middles of the boxes around groups of neighbouring edges, at two grouping distances."""
     places = []
     for reach in (2, 5):
         joined = cv2.morphologyEx(edges.thin.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8))
@@ -201,7 +206,11 @@ def chosen(
     view: PanelProjection,
     plate_m: tuple[float, float],
 ) -> tuple[Detection, ...]:
-    """Accepted candidates, likeliest first, then the refused ones; see the module's text."""
+    """Return the accepted candidates, most likely first, then the refused ones; see the module's docstring.
+
+    Args:
+        places, looks: (N, 2) candidates in pixels of the rectified plate, and (N, LENGTH) their features.
+    """
     knowledge = knowledge.for_image(noisy=ground.noisy)
     known = prepared(knowledge)
     mean_of = NOISY_MEAN_OF if ground.noisy else 1
@@ -219,7 +228,7 @@ def chosen(
     accepted, refused = [], []
     for i in order:
         if near[i] > to_nothing[i] + SECOND_LOOK:
-            break  # sorted: nothing better follows
+            break  # the rest is even nearer to nothing
         if near[i] > FURTHEST:
             continue
         likest = knowledge.kinds[best[i]]
@@ -254,6 +263,7 @@ def _is_taken(place: Array, reach: float, taken: Sequence[tuple[float, float, fl
 
 
 def _refusal(near: float, confidence: float, rival: str) -> str | None:
+    """Return the reason for a refusal; None if the candidate is accepted."""
     if near > FURTHEST:
         return "unlike everything taught: teach it, or come closer"
     if confidence >= ANSWER_AT:
@@ -263,11 +273,11 @@ def _refusal(near: float, confidence: float, rival: str) -> str | None:
 
 
 def _centred(ground: Ground, place: Array, known: Prepared, kind: int) -> Array:
-    """Refine a place to the one near by that is most similar to the taught features of the kind in that column.
+    """Return the place near the given one whose features are most similar to the kind `kind` (column of `known`).
 
-    A shadow or a wall may shift the middle of a sub-object, but hardly the features as a whole, which were taught at
-    the true middles. The result is the mean of a cross of places, weighted towards small distances, computed twice, the
-    second time finer.
+    A shadow or a wall may shift the middle of a sub-object, but hardly affects the features as a whole, which were
+    taught at the true middles. The result is the mean of a cross of places, weighted towards small distances, computed
+    twice, the second time finer.
     """
     for step in CENTRING_STEPS_PX:
         tried = place + step * CROSS
@@ -281,6 +291,13 @@ def _candidate(
     place: Array, middle: Array, names: list[str], kinds: Array, to_nothing: float, size: tuple[float, float],
     view: PanelProjection, plate_m: tuple[float, float], *, even: float,
 ) -> Detection:  # fmt: skip
+    """Build the detection for a place from the distances to all kinds.
+
+    Args:
+        place, middle: (2,) place with that look, and the object's middle, pixels of the rectified plate.
+        kinds, to_nothing: distances to the kinds `names`, and to "nothing".
+        even: lead at which the confidence is one half.
+    """
     order = np.argsort(kinds)
     first, second = int(order[0]), int(order[min(1, len(order) - 1)])
     to_second = float(kinds[second]) if second != first else np.inf
@@ -305,5 +322,5 @@ def _candidate(
 
 
 def _on_plate(place: Array, plate_m: tuple[float, float]) -> Array:
-    """(2,) point on the plate of a pixel of the rectified plate."""
+    """Return the point (2,) on the plate at a pixel of the rectified plate."""
     return np.array([place[0] / PLATE_PX_PER_M - plate_m[0] / 2, plate_m[1] / 2 - place[1] / PLATE_PX_PER_M])

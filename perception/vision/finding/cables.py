@@ -1,4 +1,4 @@
-"""Detection of cables that hang before a plate, and removal of them from the picture.
+"""Detection of cables that hang in front of a plate, and their removal from the picture.
 
 A cable is a dark band of constant width that runs from the top of the plate to the bottom or to a side; nothing on a
 panel is that long. Its course is the path with the largest darkness relative to both of its sides (dynamic programming,
@@ -17,24 +17,24 @@ from hal.jit import compiled
 
 Float32 = NDArray[np.float32]
 
-ACROSS, ALONG = 2, 4  # px of the picture a cell of the search
-HALVES = np.array([1, 2, 3])  # cells of half a cable's width
-FULL = 0.25  # of the plate's gray: a band that is darker by this is wholly dark
-EVEN = 0.5  # darkness that speaks neither for a cable nor against it
-LEAST = 0.03  # mean darkness above `EVEN`, over the plate's height; 0.01 is the most without cables
-BEND = 0.7  # price of a change of slope by one
-MARGIN = 12  # cells beside the plate, where a cable may run unseen
-MOST = 3
-TAKEN = 4  # cells to either side of a cable where no further one is looked for
-SURE = 0.3
-REACH_PX = 18  # of the strip along a course in which its width is measured
-SHIFTS_PX = 6  # most that a course is moved when it is refined
-SIDES_SEEN = 0.85  # a cable ends where its sides' gray is reached to this share
-STEADY = 13  # rows agree on where the cable is
+ACROSS, ALONG = 2, 4  # size in px of a cell of the search
+HALVES = np.array([1, 2, 3])  # possible values of half a cable's width, in cells
+FULL = 0.25  # share of the plate's gray by which a band must be darker to have darkness 1
+EVEN = 0.5  # darkness that is evidence neither for nor against a cable
+LEAST = 0.03  # least mean darkness of a cable above `EVEN`, over the plate's height; 0.01 is the maximum without cables
+BEND = 0.7  # cost of a change of slope by one
+MARGIN = 12  # cells beside the plate, where a cable may run outside the picture
+MOST = 3  # cables that are searched for
+TAKEN = 4  # cells on either side of a cable in which no further one is searched for
+SURE = 0.3  # darkness from which a cable is certain
+REACH_PX = 18  # half width of the strip along a course in which the width of the cable is measured
+SHIFTS_PX = 6  # largest shift of a course when it is refined
+SIDES_SEEN = 0.85  # a cable ends where this share of its contrast to the sides is lost
+STEADY = 13  # rows over which the position of a cable is smoothed
 
 
 def without_cables(picture: Image, plate_gray: Float32) -> Image:
-    """The (H, W) picture of a plate with its cables interpolated away; the same picture if there is none."""
+    """Return the picture (H, W) of a plate with its cables interpolated away; the same picture if there are none."""
     height, width = picture.shape
     cells = (width // ACROSS, height // ALONG)
     small, level = (cv2.resize(p, cells, interpolation=cv2.INTER_AREA) for p in (picture, plate_gray))
@@ -56,7 +56,10 @@ def without_cables(picture: Image, plate_gray: Float32) -> Image:
 def _middle(
     picture: Image, plate_gray: Float32, course: NDArray[np.int64], dark: Float32
 ) -> tuple[NDArray[np.int64], Array, float] | None:
-    """(N,) rows that a cable crosses, (N,) its middle in them, and half of its width, px; None for less than a stub."""
+    """Return the rows (N,) that a cable crosses, its middle (N,) in them, and half of its width, px.
+
+    None if it is too short. `course`: cell of the cable in every row of cells; `dark`: the result of `_darkness`.
+    """
     height, width = picture.shape
     inside = (course >= 0) & (course < dark.shape[1])
     sure = np.flatnonzero(inside & (dark[np.arange(len(course)), np.clip(course, 0, dark.shape[1] - 1)] > SURE))
@@ -78,13 +81,13 @@ def _middle(
 
 
 def _strip(picture: Image, rows: NDArray[np.int64], at: Array) -> Array:
-    """(N, 2 * REACH_PX + 1) gray values across a course."""
+    """Return the gray values (N, 2 * REACH_PX + 1) across a course."""
     u = np.clip(np.round(at[:, None] + np.arange(-REACH_PX, REACH_PX + 1)), 0, picture.shape[1] - 1).astype(int)
     return np.asarray(picture[rows[:, None], u], float)
 
 
 def _extent(profile: Array) -> tuple[int, int]:
-    """First and last pixel of the dark band in the middle of a profile."""
+    """Return the first and last pixel of the dark band in the middle of a profile."""
     side = float(np.median(np.r_[profile[:4], profile[-4:]]))
     core = REACH_PX + int(profile[REACH_PX - 3 : REACH_PX + 4].argmin()) - 3
     end = profile[core] + SIDES_SEEN * (side - profile[core])
@@ -97,7 +100,7 @@ def _extent(profile: Array) -> tuple[int, int]:
 
 
 def _shift(strip: Array, middle: float, half: float) -> Array:
-    """(N,) offset of each row's darkest band from the middle, smoothed over neighbouring rows."""
+    """Return the offset (N,) of each row's darkest band from the middle, smoothed over neighbouring rows."""
     reach = max(1, round(half) - 1)
     sums = np.pad(np.cumsum(strip, axis=1), ((0, 0), (1, 0)))
     tried = np.clip(round(middle) + np.arange(-SHIFTS_PX, SHIFTS_PX + 1), reach + 4, strip.shape[1] - reach - 5)
@@ -116,7 +119,7 @@ def _shift(strip: Array, middle: float, half: float) -> Array:
 
 
 def _steady(at: Array) -> Array:
-    """(N,) smoothed along the cable, its ends kept."""
+    """Return the positions (N,) smoothed along the cable, with its ends unchanged."""
     reach = STEADY // 2
     if len(at) <= reach:
         return at
@@ -125,7 +128,7 @@ def _steady(at: Array) -> Array:
 
 
 def _bridged(picture: Image, rows: NDArray[np.int64], at: Array, half: float) -> Image:
-    """The picture with the band replaced by a linear interpolation between its two sides, in every row."""
+    """Return the picture with the band replaced in every row by a linear interpolation between its two sides."""
     out = picture.copy()
     _bridge(out, rows, np.floor(at - half).astype(np.int64) - 1, np.ceil(at + half).astype(np.int64) + 1)
     return out
@@ -133,7 +136,7 @@ def _bridged(picture: Image, rows: NDArray[np.int64], at: Array, half: float) ->
 
 @compiled
 def _bridge(picture: Image, rows: NDArray[np.int64], left: NDArray[np.int64], right: NDArray[np.int64]) -> None:
-    """Interpolate one row in place. A side outside the picture takes the gray of the other side."""
+    """Interpolate the given rows in place; a side outside the picture gets the gray of the other side."""
     width = picture.shape[1]
     for k in range(len(rows)):
         row = picture[rows[k]]
@@ -150,7 +153,10 @@ def _bridge(picture: Image, rows: NDArray[np.int64], left: NDArray[np.int64], ri
 
 @compiled
 def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Float32:
-    """(H, W) darkness of a band about each cell relative to both of its sides, the maximum over several widths."""
+    """Return the darkness (H, W) of a band around each cell relative to both of its sides.
+
+    It is the maximum over the half widths `halves`, in cells. `level`: gray of the plate.
+    """
     height, width = small.shape
     out = np.full((height, width), np.float32(-0.5))
     sums = np.zeros(width + 1, np.float32)
@@ -170,7 +176,10 @@ def _darkness(small: Float32, level: Float32, halves: NDArray[np.int64]) -> Floa
 
 @compiled
 def _course(gain: Float32, bend: float) -> tuple[NDArray[np.int64], float]:
-    """(H,) cell per row of the top-to-bottom path with the largest gain, and that gain; slopes are at most two cells per row."""
+    """Return the cell (H,) per row of the top-to-bottom path with the largest gain, and that gain.
+
+    The path moves at most two cells sideways per row; a change of its slope costs `bend`.
+    """
     height, width = gain.shape
     slopes = 5
     price = np.float32(bend)

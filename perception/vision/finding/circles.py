@@ -1,6 +1,6 @@
 """Hough detection of circles in the plate's rectified picture.
 
-Every edge pixel votes for the centres at which its gradient points, for every radius (D. H. Ballard, Pattern
+Every edge pixel votes, for every radius, for the centres at which its gradient points (D. H. Ballard, Pattern
 Recognition 13(2), 1981). A candidate is then verified by the share of its outline that has an edge along the normal.
 """
 
@@ -17,13 +17,14 @@ from hal.arrays import Array
 from hal.jit import compiled, inlined
 from perception.vision.finding.shapes import Edges, Float32
 
-SMALL_PX = 24.0
-CIRCLE_SAMPLES = 40
-CIRCLES_TRIED = 90
+SMALL_PX = 24.0  # radius up to which circles are searched in small cells
+CIRCLE_SAMPLES = 40  # points on an outline
+CIRCLES_TRIED = 90  # peaks of the votes that are verified
 LEAST_COVERAGE = 0.45
-HOPELESS_COVERAGE = 0.25
-ALIGNED = 0.8  # cosine between an edge's gradient and the outline's normal
-STEPS_LARGE_PX = np.array([3.0, 1.5, 0.7])  # of the search about a vote's peak, whose cells are larger for large radii
+HOPELESS_COVERAGE = 0.25  # candidates below it are not refined
+ALIGNED = 0.8  # least cosine between an edge's gradient and the outline's normal
+# Of the search around a peak of the votes, whose cells are larger for large radii.
+STEPS_LARGE_PX = np.array([3.0, 1.5, 0.7])
 STEPS_SMALL_PX = STEPS_LARGE_PX[1:]
 TURNS = np.linspace(0, 2 * np.pi, CIRCLE_SAMPLES, endpoint=False)
 NORMALS = np.column_stack([np.sin(TURNS), -np.cos(TURNS)])
@@ -31,7 +32,7 @@ NORMALS = np.column_stack([np.sin(TURNS), -np.cos(TURNS)])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Circle:
-    """A circle in picture pixels; `coverage` is the share of its outline that is an edge."""
+    """A circle in picture pixels; `coverage` is the share of its outline on which there is an edge."""
 
     u: float
     v: float
@@ -40,13 +41,13 @@ class Circle:
 
 
 def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circle]:
-    """Verified circles with radii between `least_px` and `most_px`, best first, near-duplicates removed."""
+    """Return the verified circles with radii between `least_px` and `most_px`, best first, without near-duplicates."""
     v, u = np.nonzero(edges.thin)
     gx, gy = edges.along_x[v, u], edges.along_y[v, u]
     length = np.hypot(gx, gy)
     points = (u.astype(np.float64), v.astype(np.float64), gx / length, gy / length)
     found = []
-    # The direction of an edge errs by a few degrees, so the votes of large circles spread: count them in larger cells.
+    # The direction of an edge is wrong by a few degrees, so the votes of large circles scatter and need larger cells.
     for low, high, step, cell in ((least_px, SMALL_PX, 1.0, 2), (max(least_px, SMALL_PX), most_px, 2.0, 4)):
         radii = np.arange(round(low), round(high) + 1, step)
         if len(radii) < 3:
@@ -70,7 +71,7 @@ def _pool(votes: Float32, radii: Array) -> None:
 
 
 def _peaks(votes: Float32, radii: Array, cell: int) -> list[tuple[float, float, float]]:
-    """The strongest local maxima over place and radius."""
+    """Return the strongest local maxima over place and radius, as (u, v, radius)."""
     best = votes.max(axis=0)
     local = (best >= cv2.dilate(best, np.ones((3, 3), np.uint8))) & (best > 0.5)
     v, u = np.nonzero(local)
@@ -88,7 +89,7 @@ def _peaks(votes: Float32, radii: Array, cell: int) -> list[tuple[float, float, 
 
 
 def _verified_circle(edges: Edges, u0: float, v0: float, r0: float) -> Circle | None:
-    """Best circle near a guess, if enough of its outline is an edge."""
+    """Return the best circle near a guess, or None if too little of its outline is an edge."""
     steps = STEPS_LARGE_PX if r0 >= SMALL_PX else STEPS_SMALL_PX
     maps = (edges.along_x, edges.along_y, edges.strength, edges.strong)
     u, v, radius, coverage = _climbed(*maps, NORMALS, steps, u0, v0, r0)
@@ -96,7 +97,7 @@ def _verified_circle(edges: Edges, u0: float, v0: float, r0: float) -> Circle | 
 
 
 def circle_coverage(edges: Edges, circles: Array) -> Array:
-    """(N,) share of the outline of (N, 3) circles (u, v, r) that has an edge along the normal, in plain numpy."""
+    """Return the share (N,) of the outline of circles (N, 3; u, v, r) with an edge along the normal, in plain numpy."""
     nx, ny = NORMALS.T
     u = np.round(circles[:, :1] + circles[:, 2:] * nx).astype(int)
     v = np.round(circles[:, 1:2] + circles[:, 2:] * ny).astype(int)
@@ -109,6 +110,7 @@ def circle_coverage(edges: Edges, circles: Array) -> Array:
 
 
 def _distinct(circles: list[Circle]) -> list[Circle]:
+    """Return the circles, best first, without those that nearly equal a better one."""
     kept: list[Circle] = []
     for c in sorted(circles, key=lambda c: c.coverage, reverse=True):
         if not any(abs(c.radius - k.radius) < 2 and hypot(c.u - k.u, c.v - k.v) < 4 for k in kept):
@@ -135,9 +137,12 @@ def _average(planes: Float32, radii: Float32) -> None:
 
 @compiled
 def _vote(votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array, cell: int) -> None:
-    """Add one vote per radius on either side of every edge pixel, radius by radius, so that one plane stays in the cache."""
+    """Add one vote per radius on either side of every edge pixel.
+
+    The loop runs radius by radius, so that one plane of votes stays in the cache.
+    """
     _, height, width = votes.shape
-    share = 1.0 / cell  # cells are powers of two: exactly as dividing, and quicker
+    share = 1.0 / cell  # the cell is a power of two, so this is exact, and faster than a division
     for k in range(len(radii)):
         plane = votes[k]
         reach = radii[k] * share
@@ -153,7 +158,7 @@ def _vote(votes: Float32, u: Array, v: Array, nx: Array, ny: Array, radii: Array
 def _covered(
     gx: Float32, gy: Float32, strength: Float32, strong: NDArray[np.bool_], normals: Array, u: float, v: float, r: float
 ) -> float:
-    """`circle_coverage` of one circle."""
+    """Return the `circle_coverage` of one circle."""
     height, width = strong.shape
     hits = 0
     for i in range(len(normals)):
@@ -170,7 +175,7 @@ def _climbed(
     gx: Float32, gy: Float32, strength: Float32, strong: NDArray[np.bool_], normals: Array, steps: Array,
     u: float, v: float, r: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """(u, v, r, coverage) after hill climbing: the best of 27 neighbours per step, with shrinking steps."""
+    """Return (u, v, r, coverage) after hill climbing: the best of 27 neighbours per step, with shrinking steps."""
     score = -1.0
     for step in steps:
         best, best_u, best_v, best_r = -1.0, u, v, r

@@ -1,4 +1,4 @@
-"""Connected components of a sparse mask by runs; only boxes and middles, which is ten times faster than labelling."""
+"""Connected components of a sparse mask by runs: only boxes and middles, which is ten times faster than labelling."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hal.jit import compiled, inlined
 
 
 def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
-    """(N, 6) left, top, width, height and middle (u, v) of every connected part, in the order of their first pixels.
+    """Return left, top, width, height and middle (u, v) of every connected part (N, 6), in raster order.
 
     Args:
         mask: (H, W) uint8, nonzero inside.
@@ -21,7 +21,10 @@ def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
 
 @compiled
 def _components(mask: NDArray[np.uint8], reach: int) -> Array:
-    """Join the runs of a row to the overlapping runs of the row above (union-find), with sums per run."""
+    """Join the runs of each row to the overlapping runs of the row above (union-find), and return `components`.
+
+    `reach`: 1 if runs that touch at a corner overlap, else 0.
+    """
     height, width = mask.shape
     most = height * (width + 1) // 2 + 1
     parent, first, last, row = np.empty((4, most), np.int32)
@@ -51,7 +54,7 @@ def _components(mask: NDArray[np.uint8], reach: int) -> Array:
 def _boxes(
     parent: NDArray[np.int32], first: NDArray[np.int32], last: NDArray[np.int32], row: NDArray[np.int32]
 ) -> Array:
-    """Box and middle of every set of runs."""
+    """Return box and middle of every set of runs."""
     number = np.full(len(parent), -1, np.int32)
     sums = np.zeros((len(parent), 7))  # left, top, right, bottom, u, v, area
     count = 0
@@ -78,6 +81,7 @@ def _boxes(
 
 @inlined
 def _root(parent: NDArray[np.int32], k: int) -> int:
+    """Return the root of run k."""
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]
@@ -86,7 +90,7 @@ def _root(parent: NDArray[np.int32], k: int) -> int:
 
 @inlined
 def _join(parent: NDArray[np.int32], a: int, b: int) -> None:
-    """Join two sets of runs; the older root is kept."""
+    """Join two sets of runs; the older root remains the root."""
     ra, rb = _root(parent, a), _root(parent, b)
     if ra < rb:
         parent[rb] = ra

@@ -1,9 +1,9 @@
-"""Features that describe the appearance of a place on the plate.
+"""Features that describe the appearance of a place on the plate: its look.
 
 On circles of growing radius around a middle, independent of the object's rotation: relative gray (median), unevenness
 (inner 70 % range), and edge strength (median and strong). Then, towards eight directions of the upright plate, relative
-gray and edges on rings: a toggle's plate is taller than wide, a display wider than high. They are logarithms of ratios
-to the plate's own gray, so exposure and light cancel; medians and directions confine the effect of a cable or a
+gray and edges on rings: a toggle's plate is taller than wide, a display wider than high. The features are logarithms of
+ratios to the plate's own gray, so exposure and light cancel; medians and directions confine the effect of a cable or a
 highlight to a few features. For closed regions: the paper's size, height, width, aspect and Fourier shape descriptors
 (C. T. Zahn and R. Z. Roskies, IEEE Trans. Computers 21(3), 1972, in the complex form of G. H. Granlund, 1972).
 """
@@ -26,8 +26,8 @@ ANGLES = (np.arange(32) + 0.5) * 2 * np.pi / 32
 AROUND_PX = (
     np.stack([np.outer(RADII_M, np.sin(ANGLES)), -np.outer(RADII_M, np.cos(ANGLES))]).reshape(2, -1) * PLATE_PX_PER_M
 )
-RANKS = (5, 16, 27)  # of 32: 15, 50 and 85 %
-AT_ONCE = 64  # places: what lies between stays in the cache, and in memory that the process already has
+RANKS = (5, 16, 27)  # of 32 sorted values: 15, 50 and 85 %
+AT_ONCE = 64  # places processed at a time, so that intermediate results stay in the cache
 EACH = len(ANGLES) // DIRECTIONS
 # (angles, DIRECTIONS) mean over two radii and the angles about a direction
 TOWARDS = np.roll(np.kron(np.eye(DIRECTIONS), np.full((EACH, 1), 0.5 / EACH)), -(EACH // 2), axis=0).astype(np.float32)
@@ -37,7 +37,7 @@ DESCRIPTORS = 12
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ground:
-    """The rectified plate, its edges, the gray it would have without objects, and whether the image is `noisy`."""
+    """The rectified plate, its edges, the gray that it would have without objects, and whether the image is `noisy`."""
 
     picture: NDArray[np.float32]
     edges: Edges
@@ -52,7 +52,9 @@ class RegionShape:
     Attributes:
         area_px, width_px, height_px: size; width and height of the upright box.
         aspect: longer over shorter side of the smallest enclosing rectangle.
-        descriptors: magnitudes of the contour's Fourier coefficients 2..13 over that of the first: no place, size, turn.
+        descriptors: magnitudes of the contour's Fourier coefficients 2..13 relative to the first, which do not depend
+        on
+            position, size and orientation.
     """
 
     area_px: float
@@ -63,7 +65,7 @@ class RegionShape:
 
 
 def plate_gray(picture: Image) -> NDArray[np.float32]:
-    """(H, W) gray of the plate itself, by a median filter wide enough to suppress every object."""
+    """Return the gray (H, W) of the plate itself, by a median filter wide enough to suppress every object."""
     small = cv2.resize(picture, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     framed = cv2.copyMakeBorder(small, 24, 24, 24, 24, cv2.BORDER_REFLECT)
     median = cv2.GaussianBlur(cv2.medianBlur(framed, 49)[24:-24, 24:-24], (0, 0), 3.0)
@@ -71,13 +73,14 @@ def plate_gray(picture: Image) -> NDArray[np.float32]:
 
 
 def look_at(ground: Ground, places_px: ArrayLike) -> Array:
-    """(N, LENGTH) features of (N, 2) places (u, v) of the rectified plate: `GROUPS`, then `AROUND_GROUPS`."""
+    """Return the features (N, LENGTH) of places (N, 2; u, v) of the rectified plate: `GROUPS`, then `AROUND_GROUPS`."""
     places = np.asarray(places_px, float).reshape(-1, 2)
     parts = [_looks(ground, places[k : k + AT_ONCE]) for k in range(0, len(places), AT_ONCE)]
     return np.concatenate(parts).astype(float) if parts else np.zeros((0, LENGTH))
 
 
 def _looks(ground: Ground, places: Array) -> NDArray[np.float32]:
+    """Return the features of a few places."""
     u, v = places[:, :1] + AROUND_PX[0], places[:, 1:] + AROUND_PX[1]
     shape = (len(places), len(RADII_M), len(ANGLES))
     gray = sample_at(ground.picture, u, v).reshape(shape)
@@ -96,20 +99,20 @@ def _looks(ground: Ground, places: Array) -> NDArray[np.float32]:
 
 
 def half_turned(looks: Array) -> Array:
-    """(N, LENGTH) features of the same places when the picture is turned by half a turn."""
+    """Return the features (N, LENGTH) that the same places have after the picture is rotated by half a turn."""
     plain = len(GROUPS) * len(RADII_M)
     tables = looks[:, plain:].reshape(len(looks), len(AROUND_GROUPS), DIRECTIONS, RINGS)
     return np.concatenate([looks[:, :plain], np.roll(tables, DIRECTIONS // 2, axis=2).reshape(len(looks), -1)], axis=1)
 
 
 def _around(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, DIRECTIONS * RINGS) means of (N, radii, angles) values, direction by direction."""
+    """Return the means (N, DIRECTIONS * RINGS) of values (N, radii, angles), direction by direction."""
     rings = values[:, : 2 * RINGS].reshape(len(values), RINGS, 2, -1).sum(axis=2)
     return np.asarray((rings @ TOWARDS).transpose(0, 2, 1).reshape(len(values), -1))
 
 
 def region_shape(mask: NDArray[np.bool_]) -> RegionShape | None:
-    """Shape of the largest part of a mask; None for less than 8 pixels."""
+    """Return the shape of the largest part of a mask; None if it has less than 8 pixels."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
         return None
@@ -129,6 +132,7 @@ def region_shape(mask: NDArray[np.bool_]) -> RegionShape | None:
 
 
 def _fourier(contour: NDArray[np.int32]) -> tuple[float, ...]:
+    """Return the Fourier shape descriptors of a closed contour (N, 2)."""
     closed = np.vstack([contour, contour[:1]]).astype(float)
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
     s = np.linspace(0.0, length[-1], 128, endpoint=False)

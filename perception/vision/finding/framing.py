@@ -1,4 +1,4 @@
-"""Check that the image shows exactly one panel, the right way up; otherwise the reading is refused."""
+"""Check that an image shows exactly one panel, and shows it upright; otherwise it is refused."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from perception.vision.projection import CameraProjection, PanelProjection, Plat
 from perception.vision.registration.register import register
 
 COARSE_WIDTH_PX = 240
-LEAST_SHARE = 0.06  # of the image: smaller plates show no objects
-SECOND_SHARE = 0.3  # of the largest region's area: a second panel that could as well be meant
-RECTANGLE_FILL = 0.85  # of its smallest enclosing rectangle that a plate's region fills
-ASPECT_RATIO = 1.3  # by which a plate seen aslant may differ from its proportions
+LEAST_SHARE = 0.06  # of the image; on smaller plates no objects are visible
+SECOND_SHARE = 0.3  # of the largest region's area; a second panel of this size could be the intended one
+RECTANGLE_FILL = 0.85  # least share of its smallest enclosing rectangle that a plate's region fills
+ASPECT_RATIO = 1.3  # factor by which the aspect of a plate seen obliquely may differ from its own
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-TURNED_LEAD = 0.15  # share of the objects' edges that must speak for another way up before it is said
-SURELY_UPRIGHT = 0.75  # a mirrored picture of a panel that is nearly symmetric shows 0.58
+TURNED_LEAD = 0.15  # by which the share of the objects' edges must be larger for another orientation to be reported
+SURELY_UPRIGHT = 0.75  # share of the edges from which a panel is upright; a mirrored, nearly symmetric panel has 0.58
 UNMIRROR = "switch off the camera's mirroring, or mirror the picture back"
 ASKEW: tuple[tuple[str, str, Callable[[Image], Image]], ...] = (
     ("mirrored", UNMIRROR, np.fliplr),
@@ -32,7 +32,7 @@ ASKEW: tuple[tuple[str, str, Callable[[Image], Image]], ...] = (
 
 
 def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | None = None) -> Plate:
-    """The plate of the one panel that fills the image.
+    """Return the plate of the one panel that fills the image.
 
     Raises:
         NotFound: none does.
@@ -52,10 +52,10 @@ def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | No
 
 
 def check_upright(gray: Image, view: PanelProjection, panel: Panel) -> None:
-    """Refuse a panel that fits better upside down or mirrored.
+    """Check that the panel does not fit better upside down or mirrored.
 
     Raises:
-        NotFound: it does; what is read where the panel file has it would be wrong.
+        NotFound: it does, so objects would be read at wrong positions.
     """
     upright, turned = (_objects_share(gray, v, panel) for v in (view, upside_down(view)))
     if turned > upright + TURNED_LEAD:
@@ -70,18 +70,19 @@ def check_upright(gray: Image, view: PanelProjection, panel: Panel) -> None:
 
 
 def _righted_share(gray: Image, panel: Panel) -> float:
-    """`_objects_share` of an image in which the plate is searched again; 0 where there is none."""
+    """Return `_objects_share` of an image in which the plate is searched for again; 0 if there is none."""
     plate = find_plate(gray, panel.width_m, panel.height_m)
     return 0.0 if plate is None else float(np.nan_to_num(_objects_share(gray, plate.view, panel)))
 
 
 def _askew(panel: Panel, how: str, share: float, upright: float, *, hint: str) -> NotFound:
+    """Return the error for a panel in another orientation, `how`."""
     edges = f"{share:.0%} of its objects' edges are found that way, {upright:.0%} upright"
     return NotFound(f"panel {panel.name!r} is {how} in this image: {edges}", hint=hint)
 
 
 def upside_down(view: PanelProjection) -> PanelProjection:
-    """The same plate turned by half a turn about its middle."""
+    """Return the view of the same plate rotated by half a turn about its middle."""
     if isinstance(view, PlateProjection):
         return PlateProjection(
             px_from_plate=view.px_from_plate @ HALF_TURN, corners_m=view.corners_m, sigma_px=view.sigma_px
@@ -97,14 +98,17 @@ def upside_down(view: PanelProjection) -> PanelProjection:
 
 
 def _objects_share(gray: Image, view: PanelProjection, panel: Panel) -> float:
-    """Share of the edges of the panel's objects that the image shows; NaN (all comparisons false) if no object has edges."""
+    """Return the share of the edges of the panel's objects that the image shows.
+
+    NaN, for which all comparisons are false, if no object has edges.
+    """
     shares = np.array(list(register(gray, view, panel).edge_share.values()))
     shares = shares[np.isfinite(shares)]
     return float(shares.mean()) if len(shares) else float("nan")
 
 
 def _panels_in(gray: Image, aspect: float) -> int:
-    """How many regions of the image look like whole plates of that aspect, none much smaller than the largest."""
+    """Return the number of regions in the image that look like whole plates of that aspect and are of similar size."""
     shrink = max(1.0, gray.shape[1] / COARSE_WIDTH_PX)
     small = np.asarray(cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA), np.uint8)
     smooth = cv2.medianBlur(small, 5)
@@ -113,7 +117,7 @@ def _panels_in(gray: Image, aspect: float) -> int:
 
 
 def _plates_among(mask: NDArray[np.uint8], aspect: float) -> int:
-    """Number of outer contours of similar size that are plates; objects on a plate are holes in it."""
+    """Return the number of outer contours of similar size that are plates; objects on a plate are holes in it."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outlines = [np.asarray(contour, np.int32) for contour in contours]
     areas = np.array([cv2.contourArea(outline) for outline in outlines])
@@ -122,6 +126,7 @@ def _plates_among(mask: NDArray[np.uint8], aspect: float) -> int:
 
 
 def _is_plate(contour: NDArray[np.int32], aspect: float) -> bool:
+    """Return whether a contour is nearly a rectangle of about that aspect."""
     (_, _), (a, b), angle = cv2.minAreaRect(contour)
     width, height = (a, b) if abs(angle) < 45 else (b, a)
     is_filled = cv2.contourArea(contour) >= RECTANGLE_FILL * a * b

@@ -12,18 +12,19 @@ from hal.arrays import Array
 from hal.jit import compiled, inlined
 from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
 
-NEXT_FURTHER = 0.02  # by which the next nearest look of a kind is further, at the median of hard drawn overviews
-CLIP = 3.0  # one number counts for three spreads at most: glare or a cable spoils some numbers, whatever is there
+# Median increase of the distance from one nearest look of a kind to the next, in hard synthetic overviews.
+NEXT_FURTHER = 0.02
+CLIP = 3.0  # most that one number counts, in spreads, because glare or a cable may corrupt some numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prepared:
-    """Taught looks over their spread, times the numbers' weights.
+    """Taught looks in the form that `nearest` reads: divided by their spread and multiplied by the weights.
 
     Attributes:
-        columns: (LENGTH, M), one column a look, the kinds side by side: one number of all looks lies together.
-        first: (kinds + 1,) where every kind's columns begin, and where the last one's end.
-        gain: (LENGTH,) that looks are multiplied by before they are compared.
+        columns: (LENGTH, M), one column per look, ordered by kind, so that the same number of all looks is contiguous.
+        first: (kinds + 1,) first column of every kind, and the end of the last one.
+        gain: (LENGTH,) factors by which looks are multiplied before they are compared.
         weights: (LENGTH,) of the numbers.
     """
 
@@ -35,7 +36,7 @@ class Prepared:
 
 @lru_cache(maxsize=4)
 def prepared(knowledge: Knowledge) -> Prepared:
-    """Prepare the taught features of all kinds for `nearest`; done once per knowledge."""
+    """Prepare the taught features of all kinds for `nearest`; the result is cached per knowledge."""
     counts = [len(kind.looks) for kind in knowledge.kinds]
     gain = knowledge.weights / knowledge.spread
     scaled = np.vstack([kind.looks for kind in knowledge.kinds]) * gain
@@ -48,7 +49,7 @@ def prepared(knowledge: Knowledge) -> Prepared:
 
 
 def distances(looks: Array, knowledge: Knowledge) -> Array:
-    """(N, kinds) distance of (N, LENGTH) features to the nearest taught example of every kind, in spreads per feature.
+    """Return the distance (N, kinds) of features (N, LENGTH) to the nearest taught example of every kind.
 
     The distance is the weighted mean of the absolute differences over the spread, each limited to `CLIP`.
     """
@@ -56,7 +57,7 @@ def distances(looks: Array, knowledge: Knowledge) -> Array:
 
 
 def nearest(looks: Array, known: Prepared, *, kind: int | None = None, mean_of: int = 1) -> Array:
-    """`distances` to prepared examples; with `kind`, (N, 1) distances to the examples of that column only.
+    """Return `distances` to prepared examples; with `kind`, distances (N, 1) to the examples of that kind only.
 
     `mean_of`: number of nearest examples of every kind over which the distance is averaged. A missing example counts as
     `NEXT_FURTHER` more distant than the last, so that a kind with one example is neither preferred nor excluded.
@@ -69,13 +70,13 @@ def nearest(looks: Array, known: Prepared, *, kind: int | None = None, mean_of: 
 
 
 def nearest_look(look: Array, kind: TaughtKind, knowledge: Knowledge) -> int:
-    """Which look of a kind is nearest to a (LENGTH,) look."""
+    """Return the index of the look of a kind that is nearest to a look (LENGTH,)."""
     difference = np.minimum(np.abs(kind.looks - look) / knowledge.spread, CLIP)
     return int((difference @ knowledge.weights).argmin())
 
 
 def distances_reference(looks: Array, knowledge: Knowledge, *, mean_of: int = 1) -> Array:
-    """The same as `distances`, or `nearest` with `mean_of`, in plain numpy."""
+    """Compute `distances`, or `nearest` with `mean_of`, in plain numpy; a reference for tests."""
     columns = []
     for kind in knowledge.kinds:
         difference = np.abs(looks[:, None] - kind.looks[None]) / knowledge.spread
@@ -86,7 +87,7 @@ def distances_reference(looks: Array, knowledge: Knowledge, *, mean_of: int = 1)
 
 
 def nothing_column(knowledge: Knowledge) -> int | None:
-    """Column of `distances` that belongs to what is not an object."""
+    """Return the column of `distances` for the kind `nothing`; None if it is not taught."""
     names = [kind.name for kind in knowledge.kinds]
     return names.index(NOTHING) if NOTHING in names else None
 
@@ -100,7 +101,7 @@ def _nearest(
     mean_of: int,
     step: float,
 ) -> NDArray[np.float32]:
-    """Compare one place with all taught examples, feature by feature.
+    """Compute the distances of every place to the nearest looks of every kind, number by number.
 
     The inner loop is vectorised with an order of summation that does not depend on the processor.
     """
@@ -123,7 +124,7 @@ def _nearest(
 
 @inlined
 def _mean_of_least(values: NDArray[np.float32], count: int, step: float) -> float:
-    """Mean of the `count` least values; missing ones are extrapolated from the last by `step`."""
+    """Return the mean of the `count` least values; missing ones are extrapolated from the last by `step`."""
     least = np.full(count, np.inf)
     for value in values:
         if value < least[-1]:

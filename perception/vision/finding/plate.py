@@ -1,10 +1,10 @@
 """Detection of the plate in an overview: four robust lines around the region that differs from the room.
 
-A rigid plate before a typical camera is fitted to the lines and then to the image's edges, so that a side outside the
-image follows from the others; where they do not determine it, it is placed at the image's border. If edges do not
-confirm a visible side (glare or shadow misled its line), the fit is repeated without that line. Each fit is also tried
-with wider search windows, and as a free homography for steep tilts and wide lenses. The fit with the most confirmed
-edges is returned.
+The projection of a rigid plate by a typical camera is fitted to the lines and then to the image's edges, so that a side
+outside the image follows from the others; if they do not determine it, it is placed at the image's border. If edges do
+not confirm a visible side (glare or shadow misled its line), the fit is repeated without that line. Each fit is also
+tried with wider search windows, and as a free homography for steep tilts and wide lenses. The fit with the most
+confirmed edges is returned.
 """
 
 from __future__ import annotations
@@ -22,22 +22,26 @@ from perception.vision.registration.outline import Outline, rectangle
 from perception.vision.registration.register import EdgeImage, confirmed, edge_image, follow_edges
 
 COARSE_WIDTH_PX = 160
-TYPICAL_FOCAL = 1.25  # of the longer image side: a lens of 44 degrees; completes a side that is cut off
-LEAST_SHARE = 0.25  # of the image: a smaller plate is not an overview
-LEAST_SIDE = 0.12  # of a side's length in the image that shows its edge; the rest is cut off
-SIDE_POINTS = 40
+# Focal length over the longer image side, a lens of 44 degrees; used to complete a side that is cut off.
+TYPICAL_FOCAL = 1.25
+LEAST_SHARE = 0.25  # of the image; with a smaller plate it is no overview
+LEAST_SIDE = 0.12  # least share of a side's length whose edge is in the image; with less the side counts as cut off
+SIDE_POINTS = 40  # samples per side
 WINDOWS_PX = (12.0, 8.0, 5.0, 3.0, 2.0)
-FAR_WINDOWS_PX = (30.0, 20.0, *WINDOWS_PX)  # for a plate whose lines were misled
+FAR_WINDOWS_PX = (30.0, 20.0, *WINDOWS_PX)  # for a plate whose lines were wrong
+# Standard deviations of the corners with the normal and with the wider windows.
 START_SIGMA_PX, FAR_SIGMA_PX = 6.0, 15.0
-FREE_WINDOWS_PX = (5.0, 3.0, 2.0)  # of the last step, which allows for a lens and a focal length that are not typical
+FREE_WINDOWS_PX = (5.0, 3.0, 2.0)  # of the last step, which allows for an untypical lens and focal length
 FREE_SIGMA_PX = 2.0
-LEAST_SIDES = 2  # that show as lines: one alone is anything's edge
-FILLED = 0.85  # of the image: then one line is enough, the other sides lie close to the image's border
-CONFIRMED = 0.7  # share of a side's visible edge
-LEAST_CONFIRMED = SIDE_POINTS // 4  # samples in all; in noise and in soft shades none is
-LEAST_SHARE_CONFIRMED = 0.55  # of the visible border; close-ups and bare walls mostly have less
-SURE_SHARE, SURE_SIDES, SURE_SIDE_VISIBLE = 0.9, 3, 16  # for `is_sure`; all development overviews have the share
-MOST_STRETCHED = 1.45  # see `_stretch`; a plate turned by a quarter has the square of its proportions, 1.8
+LEAST_SIDES = 2  # least number of sides that are visible as lines; a single line may be any edge
+# Share of the image that a plate fills from which one line is enough, as the other sides are at the image's border.
+FILLED = 0.85
+CONFIRMED = 0.7  # share of a side's visible part that is an edge
+LEAST_CONFIRMED = SIDE_POINTS // 4  # least number of confirmed samples in all; noise and soft shadows give none
+LEAST_SHARE_CONFIRMED = 0.55  # of the visible border; most close-ups and bare walls have less
+# For `is_sure`; the share is reached by all development overviews.
+SURE_SHARE, SURE_SIDES, SURE_SIDE_VISIBLE = 0.9, 3, 16
+MOST_STRETCHED = 1.45  # see `_stretch`; a plate rotated by a quarter turn has the square of its proportions, 1.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,9 +49,9 @@ class Plate:
     """A plate found in an image.
 
     Attributes:
-        view: plate metres (origin in the middle, y up) to pixels.
-        sides_seen: top, right, bottom, left: whether the image shows that side.
-        is_sure: whether the border alone says where the plate is; else it may be the edge of something else.
+        view: projection from plate metres (origin in the middle, y up) to pixels.
+        sides_seen: whether the image shows the top, right, bottom and left side.
+        is_sure: whether the border alone confirms the plate; if not, it may be the edge of something else.
     """
 
     view: PlateProjection
@@ -56,7 +60,7 @@ class Plate:
 
 
 def find_plate(gray: Image, width_m: float, height_m: float, *, focal_px: float | None = None) -> Plate | None:
-    """The plate of known size that fills most of the image, upright within 45 degrees; None when there is none."""
+    """Return the plate of known size that fills most of the image, upright within 45 degrees; None if there is none."""
     shrink = max(1.0, gray.shape[1] / COARSE_WIDTH_PX)
     small = np.asarray(cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA), np.uint8)
     mask = _plate_mask(small)
@@ -94,7 +98,7 @@ class _Search:
     focal_px: float
 
     def best(self, lines: list[Array | None]) -> PlateProjection | None:
-        """The plate that the image's edges confirm best; None when the lines make none, or hardly an edge confirms it."""
+        """Return the plate that the image's edges confirm best; None if no attempt gives a confirmed plate."""
         view = self._laid(lines, WINDOWS_PX, START_SIGMA_PX)
         found = [] if view is None else [(self._score(view), view)]
         if view is None or self._least_confirmed(view) < CONFIRMED:
@@ -120,10 +124,10 @@ class _Search:
         return bool(sides.sum() >= SURE_SIDES and near.sum() >= SURE_SHARE * visible.sum())
 
     def _stretch(self, view: PlateProjection) -> float:
-        """How much longer one direction of the plate would be than the other, before the camera of known focal length.
+        """Return the ratio of the scales of the plate's two directions for a camera of the known focal length.
 
-        The columns of K^-1 H of a rigid plate are as long as each other; a focal length that is off by half makes them
-        differ by 1.2 at a tilt of 40 degrees.
+        The columns of K^-1 H of a rigid plate have the same length, so the ratio is 1; a focal length that is wrong by
+        half gives 1.2 at a tilt of 40 degrees.
         """
         rows, columns = self.image.smooth.shape
         K = np.array([[self.focal_px, 0, (columns - 1.0) / 2], [0, self.focal_px, (rows - 1.0) / 2], [0, 0, 1.0]])
@@ -156,26 +160,26 @@ class _Search:
         return follow_edges(self.image, view, self.outline, WINDOWS_PX)
 
     def _corners_px(self, lines: list[Array | None]) -> Array | None:
-        """(4, 2) corners in the image itself; None when the lines make none."""
+        """Return the corners (4, 2) in the image itself; None if the lines do not determine them."""
         width, height = self.corners_m.max(axis=0) * 2
         corners = _corners(lines, self.coarse_shape, float(width / height), self.focal_px / self.shrink)
         return None if corners is None else (corners + 0.5) * self.shrink - 0.5
 
     def _score(self, view: PlateProjection) -> int:
-        """Number of border samples that an edge confirms, minus the visible ones that none confirms."""
+        """Return the number of border samples that an edge confirms, minus the visible ones that none confirms."""
         visible, near = confirmed(self.image, view, self.outline)
         return 2 * int(near.sum()) - int(visible.sum())
 
     def _least_confirmed(self, view: PlateProjection) -> float:
-        """Share of the visible samples with an edge, on the worst side of which enough is visible."""
+        """Return the least share of confirmed samples among the sides of which enough is visible."""
         visible, near = (mask.reshape(4, -1).sum(axis=1) for mask in confirmed(self.image, view, self.outline))
         return float(np.where(visible >= SIDE_POINTS // 5, near / np.maximum(visible, 1), 1.0).min())
 
 
 def _plate_mask(small: Image) -> NDArray[np.bool_]:
-    """Largest bright or dark region around the middle of the picture."""
+    """Return the largest bright or dark region around the middle of the picture."""
     smooth = cv2.GaussianBlur(small, (0, 0), 1.5)
-    # Logarithms: a plate keeps its ratio to the room where the light fades. Glare and white faces are held back.
+    # In logarithms a plate's ratio to the room is constant even if the light fades; glare and white faces are capped.
     level = np.log(smooth.astype(np.float32) + 4.0)
     held = np.minimum(level, float(np.median(level)) + 0.2)
     low, high = float(np.percentile(held, 1)), float(held.max())
@@ -192,7 +196,10 @@ def _plate_mask(small: Image) -> NDArray[np.bool_]:
 
 
 def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
-    """(a, b, c) of the line a x + b y = c along the top, right, bottom or left border; None when the image cuts it off."""
+    """Return (a, b, c) of the line a x + b y = c along the top, right, bottom or left border of the mask.
+
+    `side` is 0 to 3. None if the image cuts that side off.
+    """
     turned = mask if side in (0, 2) else mask.T
     columns = np.flatnonzero(turned.any(axis=0))
     if len(columns) < 12:
@@ -210,7 +217,7 @@ def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
 
 
 def _robust_line(x: Array, y: Array) -> tuple[float, float]:
-    """Slope and intercept by least squares with Cauchy weights from a median start."""
+    """Return slope and intercept by least squares with Cauchy weights, starting from medians."""
     half = len(x) // 2
     pairs = (y[half : half * 2] - y[:half]) / np.maximum(x[half : half * 2] - x[:half], 1e-9)
     slope = float(np.median(pairs))
@@ -224,7 +231,10 @@ def _robust_line(x: Array, y: Array) -> tuple[float, float]:
 
 
 def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, focal: float) -> Array | None:
-    """(4, 2) corners, upper left first and clockwise; a missing side is placed by the known proportions."""
+    """Return the corners (4, 2), upper left first and clockwise; the known proportions determine a missing side.
+
+    `focal`: focal length in pixels of this image; `aspect`: width over height of the plate.
+    """
     height, width = shape
     border = [
         np.array([0.0, 1.0, -0.5]),
@@ -245,10 +255,10 @@ def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, f
 
 
 def _completed(corners: Array, missing: int, *, middle: Array, focal: float, aspect: float) -> Array | None:
-    """Corners of a rectangle of known proportions of which one side is cut off.
+    """Return the corners of a rectangle of known proportions of which one side is cut off.
 
-    The two sides that meet the missing one meet in the vanishing point of their direction d; the opposite side lies in
-    the plane with normal m. The other direction is m x d, so the whole plane is known.
+    The two sides next to the missing one intersect in the vanishing point of their direction d; the opposite side lies
+    in the plane through the camera with normal m. The other direction is m x d, so the whole plane is known.
     """
     order = np.roll(np.arange(4), -missing)  # the missing side runs from order[0] to order[1]
     far_a, far_b, near_b, near_a = corners[order]
@@ -261,7 +271,7 @@ def _completed(corners: Array, missing: int, *, middle: Array, focal: float, asp
     d = d / np.linalg.norm(d)
     across = np.cross(m, d)
     across = across / np.linalg.norm(across)
-    # b lies on the ray of near_b with b - a along `across`: a + length * across = t * ray_b, with a at depth 1.
+    # b is on the ray of near_b, and b - a is along `across`: a + length * across = t * ray_b, with a at depth 1.
     solved = np.linalg.lstsq(np.column_stack([across, -b]), -a, rcond=None)[0]
     length = abs(float(solved[0])) * ratio
     towards = (
@@ -279,7 +289,7 @@ def _completed(corners: Array, missing: int, *, middle: Array, focal: float, asp
 
 
 def _cut(first: Array, second: Array) -> Array:
-    """Crossing of two lines; NaN for parallel ones."""
+    """Return the intersection of two lines; NaN if they are parallel."""
     A = np.array([first[:2], second[:2]])
     if abs(float(np.linalg.det(A))) < 1e-9:
         return np.full(2, np.nan)

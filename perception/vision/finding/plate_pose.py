@@ -1,4 +1,4 @@
-"""Pose of a plate of known size before a camera of known or typical focal length: six parameters instead of eight.
+"""Pose of a plate of known size in front of a camera of known or typical focal length: six parameters instead of eight.
 
 Two of a homography's eight degrees of freedom are no motion of a rigid plate. Without them a side that is outside the
 image, or hidden by a cable or glare, follows from the others.
@@ -18,12 +18,14 @@ from perception.vision.projection import homography
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RigidPlate:
-    """A `PanelProjection` of the plate's plane; moves by a turn (rad, camera axes), then a shift in units of its distance.
+    """Projection (`PanelProjection`) of a rigid plate.
+
+    It moves by a rotation (rad, camera axes), then by a shift in units of its distance.
 
     Attributes:
         R, t_m: camera_from_plate, (3, 3) and (3,).
-        focal_px, middle_px: of a camera without lens errors.
-        sigma_px: one sigma of what a motion does to a pixel.
+        focal_px, middle_px: of a camera without lens distortion.
+        sigma_px: standard deviation of the motion, as its effect on a pixel.
     """
 
     R: Array
@@ -34,24 +36,24 @@ class RigidPlate:
 
     @property
     def prior_sigma(self) -> Array:
-        """(6,) turns and relative shifts that move the plate's border by about `sigma_px`."""
+        """Rotations and relative shifts (6,) that move the plate's border by about `sigma_px`."""
         reach = self.sigma_px / self.focal_px
         return np.array([4.0 * reach] * 3 + [reach, reach, 2.0 * reach])
 
     @property
     def px_from_plate(self) -> Array:
-        """(3, 3) homography from the plate (m) to pixels."""
+        """Homography (3, 3) from the plate (m) to pixels."""
         K = np.array([[self.focal_px, 0, self.middle_px[0]], [0, self.focal_px, self.middle_px[1]], [0, 0, 1.0]])
         return np.asarray(K @ np.column_stack([self.R[:, 0], self.R[:, 1], self.t_m]))
 
     def project(self, points_m: ArrayLike) -> Array:
-        """(N, 2) pixels of (N, 2 or 3) points of the plate's plane; NaN behind the camera."""
+        """Return the pixels (N, 2) of points (N, 2 or 3) of the plate's plane; NaN behind the camera."""
         points = np.asarray(points_m, float)[:, :2]
         h = np.column_stack([points, np.ones(len(points))]) @ self.px_from_plate.T
         return np.asarray(h[:, :2] / np.where(h[:, 2:] > 0, h[:, 2:], np.nan))
 
     def moved(self, delta: Array) -> RigidPlate:
-        """The plate after a motion by (6,) parameters."""
+        """Return the plate after a motion by `delta` (6,)."""
         turn = cv2.Rodrigues(np.asarray(delta[:3], float))[0]
         return replace(self, R=turn @ self.R, t_m=self.t_m + float(np.linalg.norm(self.t_m)) * delta[3:])
 
@@ -59,10 +61,10 @@ class RigidPlate:
 def rigid_plate(
     corners_m: Array, corners_px: Array, *, focal_px: float, middle_px: Array, sigma_px: float
 ) -> RigidPlate:
-    """The rigid plate nearest to four corners.
+    """Return the rigid plate that fits four corners best.
 
-    The columns of K^-1 H are r1, r2 and t up to a common scale (Z. Zhang, IEEE PAMI 22(11), 2000, sec. 3.1); the nearest
-    rotation follows by singular values.
+    The columns of K^-1 H are r1, r2 and t up to a common factor (Z. Zhang, IEEE PAMI 22(11), 2000, sec. 3.1); the
+    nearest rotation follows from a singular value decomposition.
     """
     H = homography(corners_m, corners_px)
     K = np.array([[focal_px, 0, middle_px[0]], [0, focal_px, middle_px[1]], [0, 0, 1.0]])

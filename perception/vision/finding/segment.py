@@ -17,12 +17,13 @@ from hal.arrays import Array, Image
 from hal.jit import compiled, inlined
 from perception.vision.noise import noise_sigma
 
-TOLERANCE = 9.0  # gray levels, at least
-NOISES = 6.0  # sigmas of the pixel noise: fewer leave thousands of single pixels, as bright parts are noisier than the median
-ROWS_APART = 4  # for the noise
+TOLERANCE = 9.0  # gray levels; least tolerance
+# Tolerance in sigmas of the noise; with less, thousands of single pixels remain, because bright parts are noisier.
+NOISES = 6.0
+ROWS_APART = 4  # rows between those that are used to estimate the noise
 
 Moments = tuple[np.int64, np.int64, np.int64]  # count, sum and sum of squares of gray levels
-SPREADS = 2.0  # of the region's own standard deviation
+SPREADS = 2.0  # tolerance in standard deviations of the region itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,7 +32,7 @@ class ImageRegions:
 
     Attributes:
         labels: (H, W) int32, region of every pixel, 0 to N - 1, numbered in raster order of their first pixels.
-        area_px, mean, variance: (N,) size, gray level and its variance.
+        area_px, mean, variance: (N,) size, mean gray level and its variance.
         middle_px: (N, 2) u, v.
         box_px: (N, 4) u, v, width, height.
     """
@@ -48,7 +49,7 @@ def grow_regions(gray: Image, *, tolerance: float | None = None) -> ImageRegions
     """Segment a gray image (H, W) uint8.
 
     Args:
-        tolerance: gray levels that a pixel may leave its region's mean by; None: by the image's own noise.
+        tolerance: largest deviation of a pixel from its region's mean, gray levels; None: from the noise of the image.
     """
     gray = np.ascontiguousarray(gray)
     if tolerance is None:
@@ -65,6 +66,7 @@ def grow_regions(gray: Image, *, tolerance: float | None = None) -> ImageRegions
 
 @inlined
 def _root(parent: NDArray[np.int32], k: int) -> int:
+    """Return the root of region k."""
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]
@@ -73,8 +75,11 @@ def _root(parent: NDArray[np.int32], k: int) -> int:
 
 @inlined
 def _fits(n: np.int64, total: np.int64, squares: np.int64, value: np.int64, tolerance: float) -> bool:
-    """Return whether a gray value belongs to a region: |I - mean| <= max(tolerance, SPREADS * sigma), no roots."""
-    d = abs(value * n - total)  # n |I - mean|: no division on the common path
+    """Return whether a gray value belongs to a region: |I - mean| <= max(tolerance, SPREADS * sigma).
+
+    `n`, `total`, `squares`: moments of the region. Square roots are avoided.
+    """
+    d = abs(value * n - total)  # n |I - mean|, without a division in the most frequent case
     if d <= tolerance * n:
         return True
     if d > 3.0 * tolerance * n:
@@ -84,13 +89,13 @@ def _fits(n: np.int64, total: np.int64, squares: np.int64, value: np.int64, tole
 
 @inlined
 def _moments(region: Array) -> Moments:
-    """Count, sum and sum of squares of a region's gray levels: whole numbers, which add faster."""
+    """Return count, sum and sum of squares of a region's gray levels as integers, which add faster."""
     return np.int64(region[0]), np.int64(region[1]), np.int64(region[2])
 
 
 @inlined
 def _begin(sums: Array, parent: NDArray[np.int32], k: int, u: int, v: int) -> None:
-    """Start an empty region at this place."""
+    """Start an empty region at pixel (u, v)."""
     parent[k] = k
     sums[k] = 0.0
     sums[k, 5], sums[k, 6], sums[k, 7] = u, u, v
@@ -98,7 +103,7 @@ def _begin(sums: Array, parent: NDArray[np.int32], k: int, u: int, v: int) -> No
 
 @inlined
 def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:
-    """Merge the regions of two roots; the older root's number is kept."""
+    """Merge the regions of two roots; returns the remaining root, the older one."""
     low, high = (a, b) if a < b else (b, a)
     parent[high] = low
     for j in range(5):
@@ -112,7 +117,7 @@ def _joined(sums: Array, parent: NDArray[np.int32], a: int, b: int) -> int:
 
 @inlined
 def _flush(sums: Array, k: int, moments: Moments, row: int, first: int, end: int) -> None:
-    """Write back the gray moments of region `k`, and add the places of its run [first, end) in a row."""
+    """Store the gray moments of region `k`, and add the positions of its run [first, end) in a row."""
     count = end - first
     region = sums[k]
     region[0], region[1], region[2] = moments
@@ -124,9 +129,12 @@ def _flush(sums: Array, k: int, moments: Moments, row: int, first: int, end: int
 
 
 @compiled
-def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # noqa: PLR0912 - a case a neighbour  # pragma: no cover - compiled
-    """One raster pass. The region of the current run has its gray moments in registers (n, total, squares): most
-    pixels have the same region above and to the left, and cost one comparison."""
+def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # noqa: PLR0912 - one case per neighbour  # pragma: no cover - compiled
+    """Do the raster pass; returns raw labels (H, W) and the sums of every region.
+
+    The region of the current run has its gray moments in registers (n, total, squares), because most pixels have the
+    same region above and to the left, and then need only one comparison.
+    """
     height, width = gray.shape
     labels = np.empty((height, width), np.int32)
     nothing = np.full(width, -1, np.int32)
@@ -183,7 +191,7 @@ def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # 
 
 @compiled
 def _numbered(labels: NDArray[np.int32], parent: NDArray[np.int32], sums: Array) -> tuple[NDArray[np.int32], Array]:
-    """Labels 0 to N - 1 in the order of the roots, in place, and the roots' sums."""
+    """Renumber the labels, in place, to 0 to N - 1 in the order of the roots; returns them and the roots' sums."""
     number = np.full(len(parent), -1, np.int32)
     out = np.empty((len(parent), 9))
     count = 0
@@ -202,6 +210,7 @@ def _numbered(labels: NDArray[np.int32], parent: NDArray[np.int32], sums: Array)
 
 @compiled
 def _enlarged(parent: NDArray[np.int32], sums: Array) -> tuple[NDArray[np.int32], Array]:
+    """Return larger copies of both arrays."""
     more_parent = np.empty(2 * len(parent), np.int32)
     more_parent[: len(parent)] = parent
     more_sums = np.empty((2 * len(sums), sums.shape[1]))

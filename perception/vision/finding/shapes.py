@@ -19,14 +19,19 @@ from perception.vision.noise import noise_sigma
 Float32 = NDArray[np.float32]
 DirectionMaps = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # flat edges, upright edges
 
-MAX_SIDES = 90
-SLOT_MOST_PX = 12  # across
+MAX_SIDES = 90  # longest runs that are paired
+SLOT_MOST_PX = 12  # largest width of a slot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edges:
-    """Gradient of a picture: `along_x`, `along_y` (gray levels a px), and `strong`, where it exceeds noise
-    and texture, and `thin`, the ridge of that."""
+    """Gradient of a picture and its edges, (H, W) each.
+
+    Attributes:
+        along_x, along_y, strength: gradient and its magnitude, gray levels per px.
+        strong: where the magnitude exceeds noise and texture.
+        thin: ridge of the magnitude where it is strong.
+    """
 
     along_x: Float32
     along_y: Float32
@@ -37,7 +42,7 @@ class Edges:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rectangle:
-    """An upright rectangle in picture pixels: middle, size, and the share of its outline that is an edge."""
+    """An upright rectangle in picture pixels: middle, size, and the share of its outline on which there is an edge."""
 
     u: float
     v: float
@@ -47,7 +52,7 @@ class Rectangle:
 
 
 def find_edges(picture: Image, *, sigma_px: float = 1.0) -> Edges:
-    """Edges of a picture; a slope counts when it exceeds four sigmas of its noise and a share of the gray level."""
+    """Return the edges of a picture: slopes of more than four sigmas of their noise and a share of the gray level."""
     smooth = np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), sigma_px), np.float32)
     gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125), np.float32)
     gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125), np.float32)
@@ -58,7 +63,7 @@ def find_edges(picture: Image, *, sigma_px: float = 1.0) -> Edges:
 
 
 def find_rectangles(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[Rectangle]:
-    """Upright rectangles with sides between `least_px` and `most_px`, verified on all four sides."""
+    """Return upright rectangles with sides between `least_px` and `most_px`, verified on all four sides."""
     flat, upright = maps
     rows, columns = _runs(flat, least_px), _runs(upright.T, least_px)
     flat_sum, upright_sum = _sums(flat, 1), _sums(upright, 0)
@@ -81,7 +86,7 @@ def find_rectangles(maps: DirectionMaps, *, least_px: float, most_px: float) -> 
 
 
 def find_slots(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[tuple[float, float]]:
-    """Middles of long thin horizontal or vertical shapes: slots and tracks, even if partly covered."""
+    """Return the middles of long thin horizontal or vertical shapes: slots and tracks, even if partly covered."""
     found = []
     flat, upright = maps
     for mask, is_flat in ((flat, True), (upright.T, False)):
@@ -95,7 +100,7 @@ def find_slots(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[
 
 
 def _thinned(gx: Float32, gy: Float32, s: Float32, strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Edge pixels that are not weaker than both neighbours along the gradient (to the nearest axis)."""
+    """Return the strong pixels that are not weaker than both neighbours along the gradient (to the nearest axis)."""
     out = np.zeros(strong.shape, bool)
     middle = s[1:-1, 1:-1]
     across_x = np.abs(gx[1:-1, 1:-1]) >= np.abs(gy[1:-1, 1:-1])
@@ -106,7 +111,7 @@ def _thinned(gx: Float32, gy: Float32, s: Float32, strong: NDArray[np.bool_]) ->
 
 
 def direction_maps(edges: Edges) -> DirectionMaps:
-    """Where there is a flat edge, and where an upright one; each widened by one pixel across."""
+    """Return where there are horizontal edges, and where vertical ones, each widened by one pixel on both sides."""
     ax, ay = np.abs(edges.along_x), np.abs(edges.along_y)
     ones = np.ones(3, np.uint8)
     flat = cv2.dilate((edges.thin & (ay > 1.8 * ax)).astype(np.uint8), ones[:, None])
@@ -115,7 +120,7 @@ def direction_maps(edges: Edges) -> DirectionMaps:
 
 
 def _runs(flat: NDArray[np.bool_], least_px: float) -> list[tuple[float, float, float]]:
-    """(start, end, row) of flat edges longer than `least_px`, short gaps bridged."""
+    """Return (start, end, row) of horizontal edges longer than `least_px`, with short gaps bridged, longest first."""
     bridged = cv2.morphologyEx(flat.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8))
     bridged = cv2.morphologyEx(bridged, cv2.MORPH_OPEN, np.ones((1, max(5, round(0.8 * least_px))), np.uint8))
     runs = [
@@ -130,7 +135,7 @@ def _runs(flat: NDArray[np.bool_], least_px: float) -> list[tuple[float, float, 
 def _pairs(
     runs: list[tuple[float, float, float]], least_px: float, most_px: float
 ) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-    """Pairs of runs that face each other."""
+    """Return the pairs of runs that are opposite sides of a rectangle."""
     out = []
     for i, a in enumerate(runs):
         for b in runs[i + 1 :]:
@@ -146,6 +151,7 @@ def _pairs(
 
 
 def _sums(mask: NDArray[np.bool_], axis: int) -> NDArray[np.int32]:
+    """Return the cumulative sums of a mask along an axis, beginning with 0."""
     pad = [(0, 0), (0, 0)]
     pad[axis] = (1, 0)
     return np.asarray(np.pad(np.cumsum(mask, axis=axis, dtype=np.int32), pad))
@@ -154,7 +160,10 @@ def _sums(mask: NDArray[np.bool_], axis: int) -> NDArray[np.int32]:
 def _judged(
     flat: NDArray[np.int32], upright: NDArray[np.int32], x0: float, y0: float, x1: float, y1: float
 ) -> Rectangle:
-    """Coverage of the four sides: the mean, limited by the worst side."""
+    """Return a rectangle with its coverage: the mean over its four sides, lowered by the worst side.
+
+    `flat`, `upright`: cumulative sums of the direction maps.
+    """
     a, b = round(max(x0, 0)), round(min(x1, flat.shape[1] - 2))
     c, d = round(max(y0, 0)), round(min(y1, upright.shape[0] - 2))
     if b - a < 4 or d - c < 4:

@@ -1,7 +1,8 @@
-"""Detection of the panel's four lights in a pair of images, off and on, and the pose that follows from them.
+"""Detection of the panel's four lights in a pair of images, with lights off and on, and of the panel's pose from them.
 
-`alignment` registers the two images, `find` extracts the blobs of the difference, `core` finds the lamp in each,
-`assign` selects the four that match the taught quadrangle (`search`), `panel_finder` combines these steps.
+`alignment` registers the two images, `find` extracts the blobs of the difference, `core` separates the lamp in each
+from its glow, `assign` selects the four that match the taught quadrangle (`search`), and `panel_finder` combines these
+steps.
 """
 
 from perception.vision.lights.alignment import CameraMoved

@@ -1,4 +1,4 @@
-"""Registration of two images of one scene between which lights, glare and exposure changed."""
+"""Registration of two images of one scene between which lights, glare and exposure have changed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hal.errors import PerceptionError
 
 Image = NDArray[np.float32]
 
-LEAST_AGREEMENT = 0.6  # gradient correlation after registration; 0.9 and more is usual, unrelated images give 0.1
-EDGE_PIXELS = 6_000  # 16 000 gave the same shift within 0.01 px
+LEAST_AGREEMENT = 0.6  # correlation of the gradients after registration; usually above 0.9, 0.1 for unrelated images
+EDGE_PIXELS = 6_000  # used for the fit; 16 000 gave the same shift within 0.01 px
 ITERATIONS = 10
-SHIFT_FIRST = 3  # iterations with translation alone; turn and growth join when most edges overlap
-TONE_BINS = 16
-COMMON_SHARE = 0.007  # of the pixels: a level that lamps alone could not fill
-FEW_EDGES = 200
+SHIFT_FIRST = 3  # iterations with translation only; rotation and growth are added when most edges overlap
+TONE_BINS = 16  # gray levels are grouped into so many bins
+COMMON_SHARE = 0.007  # of the pixels: a gray level so frequent cannot come from lamps alone
+FEW_EDGES = 200  # with fewer edge pixels no registration is attempted
 
 
 class CameraMoved(PerceptionError):
@@ -31,12 +31,12 @@ class ImageAlignment:
     """Registration of the first image to the second.
 
     Attributes:
-        second_from_first: (2, 3) affine map of pixels (shift, turn and growth).
-        gain, offset: grey levels, second = gain * first + offset.
+        second_from_first: (2, 3) affine map of pixels (shift, rotation and growth).
+        gain, offset: gray levels, second = gain * first + offset.
         shift_px: (2,) motion of the image centre.
-        warped: (H, W) the first image resampled to the second's view, in the second's grey levels.
-        inside: (H, W) True where `warped` is known.
-        agreement: correlation of the gradients, 0..1; 1 also when the scene has no edges to compare.
+        warped: (H, W) the first image resampled to the second's view, in the second's gray levels.
+        inside: (H, W) whether `warped` is known.
+        agreement: correlation of the gradients, 0 to 1; 1 also if the scene has no edges to compare.
     """
 
     second_from_first: Array
@@ -49,14 +49,14 @@ class ImageAlignment:
 
 
 def register(first: Image, second: Image, *, noise: float) -> ImageAlignment:
-    """Motion and gain between two gray images, robust against what changed.
+    """Estimate motion and gain between two gray images, robustly against what has changed.
 
-    Phase correlation of the half-size gradient images starts a Gauss-Newton fit of shift, turn, growth and brightness
-    over the strongest edges with Tukey's weights.
+    Phase correlation of the half-size gradient images gives the start of a Gauss-Newton fit of shift, rotation, growth
+    and brightness over the strongest edges, with Tukey's weights.
 
     Args:
-        first, second: (H, W) grey levels.
-        noise: standard deviation of a pixel (grey levels); edges weaker than it say nothing.
+        first, second: (H, W) gray levels.
+        noise: standard deviation of a pixel (gray levels); weaker edges are ignored.
 
     Raises:
         CameraMoved: after the fit the edges still do not agree.
@@ -67,7 +67,7 @@ def register(first: Image, second: Image, *, noise: float) -> ImageAlignment:
     strength = np.hypot(gx, gy)
     rows, columns = _strong_edges(strength, least=3.0 * noise)
     if min(len(rows), len(_strong_edges(np.hypot(*_gradients(first)), least=3.0 * noise)[0])) < FEW_EDGES:
-        return _unmoved(first, second)  # in the dark the lights themselves are the only edges
+        return _unmoved(first, second)  # in the dark only the lights themselves have edges
     start = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     start[:, 2] = _coarse_shift(first, second)
     edges = _Edges(rows=rows, columns=columns, gradients=(gx, gy))
@@ -91,6 +91,7 @@ class _Edges:
 
 
 def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: float) -> ImageAlignment:
+    """Fit shift, rotation, growth, gain and offset by Gauss-Newton steps, starting from an affine map (2, 3)."""
     rows, columns = edges.rows, edges.columns
     height, width = second.shape
     gx, gy = (g[rows, columns].astype(float) for g in edges.gradients)
@@ -109,7 +110,7 @@ def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: fl
         J, e = np.where(known[:, None], J, 0.0), np.where(known, e, 0.0)
         step = np.linalg.lstsq((J * w[:, None]).T @ J, (J * w[:, None]).T @ e, rcond=1e-12)[0]
         gain, offset = gain + step[0], offset + step[1]
-        # Moving the first image's content by a + B (p - centre) shows as -gradient . that in the second.
+        # If the content moves by a + B (p - centre), the gray level of a pixel changes by -gradient . (that motion).
         turn, growth = (step[4] / width, step[5] / width) if len(step) > 4 else (0.0, 0.0)
         move = np.array([[1.0 - growth, turn, 0.0], [-turn, 1.0 - growth, 0.0], [0.0, 0.0, 1.0]])
         centre = np.array([width / 2.0, height / 2.0])
@@ -121,6 +122,7 @@ def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: fl
 
 
 def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> ImageAlignment:
+    """Resample the first image with the fitted map, and compute gray levels and agreement."""
     import cv2
 
     height, width = second.shape
@@ -143,9 +145,9 @@ def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> ImageA
 
 
 def _tones(first: NDArray[Any], second: NDArray[Any]) -> tuple[float, float]:
-    """Gain and offset between grey levels, from the median change at each level that is common in the image.
+    """Return gain and offset between gray levels, from the median change at each level that is common in the image.
 
-    On edges alone the gain would come out wrong: resampling flattens them.
+    A gain fitted on edges alone would be wrong, because resampling flattens them.
     """
     first, second = first[::7], second[::7]
     levels = np.clip(first / (256.0 / TONE_BINS), 0, TONE_BINS - 1).astype(np.intp)
@@ -161,7 +163,7 @@ def _tones(first: NDArray[Any], second: NDArray[Any]) -> tuple[float, float]:
 
 
 def _robust_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Correlation without the tenth that differs most, because lights and glare may change."""
+    """Return the correlation without the tenth of the values that differ most, because lights and glare may change."""
     rest = np.abs(a - b)
     keep = rest <= np.quantile(rest, 0.9)
     a, b = a[keep], b[keep]
@@ -169,6 +171,7 @@ def _robust_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
 
 
 def _unmoved(first: Image, second: Image) -> ImageAlignment:
+    """Return a registration without motion, for images with too few edges."""
     gain, offset = _tones(first.ravel(), second.ravel())
     return ImageAlignment(
         second_from_first=np.eye(3)[:2], gain=gain, offset=offset, shift_px=(0.0, 0.0),
@@ -177,7 +180,7 @@ def _unmoved(first: Image, second: Image) -> ImageAlignment:
 
 
 def _gradients(image: Image) -> tuple[Image, Image]:
-    """Central differences of the slightly smoothed image, grey levels a pixel."""
+    """Return the central differences of the slightly smoothed image, gray levels per pixel."""
     import cv2
 
     return (
@@ -187,6 +190,7 @@ def _gradients(image: Image) -> tuple[Image, Image]:
 
 
 def _strong_edges(strength: Image, *, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns of the strongest edge pixels, at most about `EDGE_PIXELS`."""
     inner = strength[4:-4, 4:-4]
     sample = inner[::4, ::4]
     share = min(1.0, EDGE_PIXELS / max(inner.size, 1))
@@ -196,7 +200,7 @@ def _strong_edges(strength: Image, *, least: float) -> tuple[NDArray[np.intp], N
 
 
 def _coarse_shift(first: Image, second: Image) -> Array:
-    """(2,) pixels by which the content of the first image moved, to about half a pixel."""
+    """Return the shift (2,) in pixels of the first image's content, accurate to about half a pixel."""
     import cv2
 
     half = (max(first.shape[1] // 2, 1), max(first.shape[0] // 2, 1))
@@ -211,7 +215,7 @@ def _coarse_shift(first: Image, second: Image) -> Array:
 
 
 def _sample(image: Image, affine: Array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
-    """The first image at the second's pixels, bilinear; NaN outside."""
+    """Return the first image's bilinear values at pixels of the second; NaN outside."""
     inverse = np.linalg.inv(affine[:, :2])
     x, y = inverse @ (np.stack([columns, rows]) - affine[:, 2:])
     height, width = image.shape

@@ -1,7 +1,8 @@
 """Selection of the panel's four lights among the bright blobs by the taught quadrangle (paper, Section II-B).
 
-A hypothesis names up to four blobs. Its score rates how lamp-like they are, how equal in true size and contrast, how
-plausible the camera's attitude is, and how well the fourth light agrees with the place that the other three predict.
+A hypothesis assigns up to four blobs to lights. Its score rates how lamp-like they are, how equal in true size and
+contrast, how plausible the camera's attitude is, and how well the fourth light agrees with the place that the other
+three predict.
 """
 
 from __future__ import annotations
@@ -29,23 +30,24 @@ from perception.vision.lights.search import (
 )
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])  # camera x right, y down, z forward; panel x right, y up, z towards the viewer
-CANDIDATES = 16
-LEAST_SCORE = 0.1
-FOCAL_TRIALS = (1.25, 0.95, 1.65)  # of the image width, when the camera is unknown; neighbours share a 4 px gate
-USUAL_RADIUS_M = 0.006
+CANDIDATES = 16  # blobs at most that are considered
+LEAST_SCORE = 0.1  # of a blob that is considered
+# Focal lengths per image width if the camera is unknown; the gate of 4 px covers values in between.
+FOCAL_TRIALS = (1.25, 0.95, 1.65)
+USUAL_RADIUS_M = 0.006  # of a lamp
 TILT_SIGMA_RAD = 0.4
 ROLL_SIGMA_RAD = 0.35
-LEAST_TOTAL = -2.0  # two dim lights in a tilted view reach 0; what is upside down or skewed beyond belief stays below
-PLAIN_SCORE = 8.0  # four lamp-like blobs where they belong reach 15
-RIVAL_MARGIN = 2.0  # in log-odds: closer hypotheses with other blobs are a tie
+LEAST_TOTAL = -2.0  # two dim lights in a tilted view reach 0; what is upside down or implausibly skewed has less
+PLAIN_SCORE = 8.0  # score of a clear result; four lamp-like blobs at the right places reach 15
+RIVAL_MARGIN = 2.0  # log-odds; hypotheses with other blobs that are closer than this make the result ambiguous
 
 
 class LightMissing(NotFound):
-    """Fewer lights than needed are seen; the message names the missing ones."""
+    """Fewer lights than needed are visible; the message names the missing ones."""
 
 
 class WrongLamp(NotFound):
-    """Enough bright blobs are seen, but they do not stand as the panel's lights do."""
+    """Enough bright blobs are visible, but they are not arranged like the panel's lights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,11 +55,12 @@ class AssignedLights:
     """The panel's lights in the image, in the order of the taught ones.
 
     Attributes:
-        points_px: (4, 2) centres as measured (not undistorted); NaN for a light that is not seen.
+        points_px: (4, 2) centres as measured (not undistorted); NaN for a light that is not visible.
         covariance_px: (4, 2, 2); NaN likewise.
-        seen: (4,) which lights are there.
-        blobs: (4,) index into the blobs, -1 when not seen.
-        score: log-odds of this choice; `margin` is its lead over the best choice with other blobs.
+        seen: (4,) whether each light is visible.
+        blobs: (4,) index into the blobs, -1 for a light that is not visible.
+        score: log-odds of this choice.
+        margin: lead of the score over that of the best choice with other blobs.
     """
 
     points_px: Array
@@ -82,17 +85,18 @@ def assign_lights(
 
     Args:
         blobs: candidates.
-        lights_m: (4, 3) or (4, 2) places of the lights in the panel's frame, m.
+        lights_m: (4, 3) or (4, 2) positions of the lights in the panel's frame, m.
         image_size_px: (width, height).
         intrinsics: the camera; without it several focal lengths and an ideal lens are tried.
-        upright: (3, 3) rotation camera_from_panel about which the camera stands, within some tens of degrees. A panel
-            that looks the same upside down needs it; the default is an upright panel seen from the front.
-        radius_m: of the lamps, roughly.
-        least: how many lights must be seen, 2 to 4; the pose needs 4.
+        upright: (3, 3) expected rotation camera_from_panel, accurate to some tens of degrees. A panel that looks the
+        same
+            upside down needs it; the default is an upright panel seen from the front.
+        radius_m: approximate radius of the lamps.
+        least: least number of visible lights, 2 to 4; the pose needs 4.
 
     Raises:
-        LightMissing: fewer than `least` lights are seen.
-        WrongLamp: four or more lamp-like blobs, but not where the panel has its lights.
+        LightMissing: fewer than `least` lights are visible.
+        WrongLamp: four or more lamp-like blobs, but not at the positions of the panel's lights.
         Ambiguous: two choices of blobs fit equally well.
         InvalidRequest: wrong shapes.
     """
@@ -116,6 +120,11 @@ def assign_lights(
 
 
 def _lights(lights_m: ArrayLike) -> Array:
+    """Return the lights as an array (4, 3).
+
+    Raises:
+        InvalidRequest: wrong shape or not finite.
+    """
     lights = np.asarray(lights_m, float)
     if lights.shape == (4, 2):
         lights = np.column_stack([lights, np.zeros(4)])
@@ -125,7 +134,7 @@ def _lights(lights_m: ArrayLike) -> Array:
 
 
 def _usable(blobs: LightBlobs) -> NDArray[np.intp]:
-    """Lamp-like blobs, best first, each place once."""
+    """Return the indices of the lamp-like blobs, best first, without those on a better one."""
     keep: list[int] = []
     for i in np.argsort(-blobs.score, kind="stable"):
         if blobs.score[i] < LEAST_SCORE or len(keep) == CANDIDATES:
@@ -142,7 +151,10 @@ def _hypotheses(
     lights: Array,
     view: tuple[tuple[int, int], CameraIntrinsics | None, Array, float],
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Best scores and their blobs; `view` is image size, camera if known, upright rotation, lamp radius."""
+    """Return the best scores (8,) and their blobs (8, 4).
+
+    `view`: image size, camera if known, upright rotation, and lamp radius.
+    """
     size, intrinsics, upright, radius_m = view
     centres = blobs.centres_px[usable]
     traits = np.stack([
@@ -158,7 +170,7 @@ def _hypotheses(
             prior = np.array([TILT_SIGMA_RAD, ROLL_SIGMA_RAD, gate_px, radius_m])
             search(ideal, traits, X, upright, camera, frame, prior, omit, best, chosen)
         if best[0] > PLAIN_SCORE and (chosen[0] >= 0).all():
-            break  # all four in their places: leaving out another one first would find the same
+            break  # all four are found, so predicting another one from three would give the same
     _pairs(centres, traits, X @ upright.T, frame, (best, chosen))
     return best, chosen
 
@@ -166,7 +178,10 @@ def _hypotheses(
 def _cameras(
     centres: Array, size: tuple[int, int], intrinsics: CameraIntrinsics | None
 ) -> list[tuple[Array, Array, float]]:
-    """(fx fy cx cy, ideal pixels, gate of the fourth light in px) for the known camera or for several guesses."""
+    """Return the known camera, or several guesses, each as (fx, fy, cx, cy), ideal pixels and a tolerance.
+
+    The tolerance is the standard deviation of the fourth light's predicted position in px.
+    """
     if intrinsics is not None:
         camera = np.array([intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px])
         return [(camera, undistort_pixels(centres, intrinsics), 2.5)]
@@ -176,7 +191,7 @@ def _cameras(
 
 
 def _pairs(centres: Array, traits: Array, model: Array, frame: Array, into: tuple[Array, NDArray[np.int64]]) -> None:
-    """Add hypotheses with only two lights: a similarity of the plane (near-frontal view) predicts the other two."""
+    """Add hypotheses with two lights only: a similarity of the plane (near-frontal view) predicts the other two."""
     reward, log_size, log_contrast, _ = traits
     flat = model[:, :2]
     for a, b in permutations(range(4), 2):
@@ -200,7 +215,7 @@ def _pairs(centres: Array, traits: Array, model: Array, frame: Array, into: tupl
 
 
 def _missing(place_px: Array, frame: Array) -> float:
-    """Score penalty for a light that is not seen at this place."""
+    """Return the score penalty for a light that is not visible at this position."""
     beyond = float(np.maximum(np.maximum(-place_px, place_px - frame), 0.0).sum())
     return MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / float(frame[0]) if beyond > 0.0 else MISSING_INSIDE
 
@@ -208,6 +223,11 @@ def _missing(place_px: Array, frame: Array) -> float:
 def _accept(
     blobs: LightBlobs, usable: NDArray[np.intp], best: Array, chosen: NDArray[np.int64], least: int
 ) -> AssignedLights:
+    """Return the best hypothesis as the result, unless a light is missing or another hypothesis is nearly as good.
+
+    Raises:
+        LightMissing, WrongLamp, Ambiguous: see `assign_lights`.
+    """
     first = chosen[0]
     seen = first >= 0
     if seen.sum() < least:

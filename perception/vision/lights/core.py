@@ -1,4 +1,4 @@
-"""Separation of a lit lamp from its own glow on the plate, which the difference image shows too."""
+"""Separation of a lit lamp from its own glow on the plate, which the difference image also shows."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-LEVELS = np.linspace(0.25, 0.9, 9)  # shares of the brightest part
-RAMP = 0.5
-RING_PX = 2  # the edge of a lamp is this wide on either side (blur and sampling)
+LEVELS = np.linspace(0.25, 0.9, 9)  # tried levels, as shares of the brightest part
+RAMP = 0.5  # share of the step from glow to lamp over which pixels are counted in part
+RING_PX = 2  # half width of a lamp's edge, because of blur and sampling
 
 
 def level_at(values: NDArray[np.float32], share: float) -> float:
-    """The value below which `share` of (n,) values lie; numpy's own quantile takes 20 times as long on so few."""
+    """Return the value below which `share` of the values (n,) lie; 20 times as fast as numpy's quantile for so few."""
     place = round(share * (len(values) - 1))
     return float(np.partition(values, place)[place])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Core:
-    """The lamp: its pixels with a share of 0 to 1 each, its level and that of the glow round it."""
+    """The lamp: weights 0 to 1 of its pixels, its level, and the level of the glow around it."""
 
     weights: Image
     top: float
@@ -31,14 +31,13 @@ class Core:
 
 
 def lamp_core(rise: Image, seed: Mask) -> Core | None:
-    """The part of a brighter region that has the steepest rim.
+    """Return the part of a brighter region that has the steepest edge; None if there is none.
 
-    The region above a level shrinks as the level rises; where it shrinks least for most of a rise, there is an edge.
-    Glow falls off slowly, so its outlines are never that. Inside the rim, pixels count by how far they stand above the
-    glow.
+    The region above a level shrinks as the level rises; where it shrinks least per rise, there is an edge. Glow
+    decreases slowly, so its outlines have no edge. Near the edge, pixels count by how far they stand out of the glow.
 
     Args:
-        rise: (H, W) on minus off about one region.
+        rise: (H, W) difference of on and off around one region.
         seed: (H, W) the region's pixels that stand out of the noise.
     """
     import cv2
@@ -54,15 +53,15 @@ def lamp_core(rise: Image, seed: Mask) -> Core | None:
     reach = cv2.dilate(body, kernel, iterations=RING_PX)
     ring = (cv2.dilate(reach, kernel) > 0) & (reach == 0)
     glow = min(level_at(rise[ring], 0.5), 0.9 * top) if ring.any() else 0.0
-    # Half way between lamp and glow is the rim; a ramp across it counts split pixels by their share, while unevenness
-    # of glow or lamp, which is cut off at the plate's edge or has a highlight when off, stays without effect.
+    # The edge is half way between lamp and glow. A ramp across it counts partly covered pixels by their share, and
+    # unevenness of the glow (cut off at the plate's edge) or of the lamp (a highlight when off) has no effect.
     share = np.clip(0.5 + (rise - 0.5 * (top + glow)) / max(RAMP * (top - glow), 1e-3), 0.0, 1.0)
     weights = np.where(reach > 0, share, 0.0).astype(np.float32)
     return Core(weights=weights, top=top, glow=glow)
 
 
 def _steepest_level(rise: Image, seed: Mask, peak: float) -> float:
-    """The level, midway between two neighbours, across which the region's mean radius changes least."""
+    """Return the level, midway between two neighbouring ones, across which the region's mean radius changes least."""
     radii = []
     for share in LEVELS:
         body = _component(rise, seed, share * peak)
@@ -71,7 +70,7 @@ def _steepest_level(rise: Image, seed: Mask, peak: float) -> float:
     alive = np.array(radii[1:]) > 1.0
     if not alive.any():
         return float(0.5 * peak)
-    # Neighbouring steps together: one step of a small lamp's radius is all sampling.
+    # Neighbouring steps are averaged, because a single step of a small lamp's radius is dominated by sampling.
     kernel = [0.5, 1.0, 0.5]
     smooth = np.convolve(shrink, kernel, mode="same") / np.convolve(np.ones_like(shrink), kernel, mode="same")
     best = int(np.argmin(np.where(alive, smooth, np.inf)))
@@ -79,7 +78,7 @@ def _steepest_level(rise: Image, seed: Mask, peak: float) -> float:
 
 
 def _component(rise: Image, seed: Mask, level: float) -> NDArray[np.uint8] | None:
-    """The 4-connected part above the level that shares most pixels with the seed."""
+    """Return the 4-connected part above the level that shares most pixels with the seed; None if none does."""
     import cv2
 
     lit = (rise > level).astype(np.uint8)

@@ -1,7 +1,7 @@
-"""Lights found in an image pair, off and on (paper, Section II-B, Fig. 5): register, subtract, threshold, grow regions.
+"""Detection of lights in a pair of images, off and on (paper, Section II-B, Fig. 5): register, subtract, grow regions.
 
-The threshold comes from the noise of the pair itself: grey-level noise by brightness, and what misregistration leaves
-on edges. Glare that moved in between is large and smooth, and falls to a top-hat.
+The threshold comes from the noise of the pair itself: gray-level noise by brightness, and residuals of misregistered
+edges. Glare that has moved between the images is large and smooth, so a top-hat filter removes it.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from perception.vision.lights.core import Core, lamp_core, level_at
 
 Image = NDArray[np.float32]
 
-SEED_SIGMAS = 6.0  # a 640x480 image has 3e5 pixels: 6 sigma leaves no noise seed
-LEAST_AREA_PX = 4.0
-CENTRE_FLOOR_PX = 0.04  # registration and lens blooming, measured on drawn pairs
+SEED_SIGMAS = 6.0  # an image of 640x480 has 3e5 pixels: with 6 sigma, noise makes no seed
+LEAST_AREA_PX = 4.0  # of a lamp
+# Least standard deviation of a centre, from registration and lens blooming; measured on synthetic pairs.
+CENTRE_FLOOR_PX = 0.04
 MOST_BLOBS = 16
-CLEAR_SIGMAS = 15.0  # a blob that stands out by this much is certain; glare that moved leaves 4 to 8
-CLEAR_BLOB_SIGMAS = 60.0  # of the whole blob; what noise and edges leave reaches about 20
-LEAST_ASPECT = 0.25  # a round lamp seen 75 degrees aslant
+CLEAR_SIGMAS = 15.0  # a blob that stands out by this much is certain; glare that has moved gives 4 to 8
+CLEAR_BLOB_SIGMAS = 60.0  # the same for the blob as a whole; noise and edges reach about 20
+LEAST_ASPECT = 0.25  # a round lamp seen at 75 degrees
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LightBlobs:
-    """Places that became brighter, best first; N may be 0.
+    """Places that became brighter, best first; there may be none.
 
     Attributes:
         centres_px: (N, 2) sub-pixel centres in the image with lights on.
@@ -38,9 +39,9 @@ class LightBlobs:
         area_px: (N,) area of the lit region.
         aspect: (N,) minor over major axis, 1 for a disc.
         fill: (N,) area over that of the ellipse with the same moments; 1 for a disc, less for arcs and corners.
-        contrast: (N,) rise of the grey level.
-        score: (N,) 0..1, how much like a lamp: round, filled, clear of the noise.
-        threshold: mean grey-level rise that made a seed, from the noise.
+        contrast: (N,) rise of the gray level.
+        score: (N,) 0 to 1, similarity to a lamp: round, filled, clear of the noise.
+        threshold: mean rise of the gray level that makes a seed, from the noise.
         shift_px: camera motion between the two images.
     """
 
@@ -61,11 +62,11 @@ class LightBlobs:
 def find_lights(
     image_off: NDArray[Any], image_on: NDArray[Any], *, largest_diameter_px: float | None = None
 ) -> LightBlobs:
-    """Everything that became brighter from one image to the other and is about as compact as a lamp.
+    """Return all places that became brighter from one image to the other and are about as compact as a lamp.
 
     Args:
         image_off, image_on: (H, W) gray or (H, W, 3) RGB, 8 bit; the camera may have moved by some pixels in between.
-        largest_diameter_px: larger regions are glare or shadow; 1/12 of the image height when None.
+        largest_diameter_px: larger regions are glare or shadow; 1/12 of the image height if None.
 
     Raises:
         InvalidRequest: not images, or of different size.
@@ -85,7 +86,7 @@ def find_lights(
 
 
 def gray_of(image: NDArray[Any]) -> Image:
-    """(H, W) float32 grey levels of an 8-bit gray or RGB image.
+    """Return the float32 gray levels (H, W) of an 8-bit gray or RGB image.
 
     Raises:
         InvalidRequest: another shape or type, or smaller than 16x16.
@@ -98,12 +99,14 @@ def gray_of(image: NDArray[Any]) -> Image:
     if min(array.shape[:2]) < 16:
         raise InvalidRequest(f"image is only {array.shape[1]}x{array.shape[0]}", hint="16x16 is the least")
     if array.ndim == 3:
-        return np.asarray(array.mean(axis=2), np.float32)  # not luma: a blue lamp is as good as a green one
+        return np.asarray(
+            array.mean(axis=2), np.float32
+        )  # not luma, in which a blue lamp would be darker than a green one
     return array.astype(np.float32)
 
 
 def _raw_noise(off: Image, on: Image) -> float:
-    """Noise of one pixel from second differences, which smooth shading and most of the edges do not reach."""
+    """Return the noise of one pixel from second differences, which smooth shading and most edges do not affect."""
     rough = [
         np.median(
             np.abs(
@@ -118,7 +121,7 @@ def _raw_noise(off: Image, on: Image) -> float:
 
 
 def _rise(on: Image, registration: ImageAlignment, diameter: float) -> Image:
-    """Difference on - off, smoothed, without what is wider than a lamp (white top-hat)."""
+    """Return the smoothed difference on - off, without anything that is wider than a lamp (white top-hat)."""
     import cv2
 
     difference = np.where(registration.inside, on - registration.warped, 0.0).astype(np.float32)
@@ -133,7 +136,7 @@ def _rise(on: Image, registration: ImageAlignment, diameter: float) -> Image:
 
 
 def _noise(rise: Image, registration: ImageAlignment) -> Image:
-    """(H, W) standard deviation of `rise` where nothing changed.
+    """Return the standard deviation (H, W) of `rise` where nothing has changed.
 
     sigma^2 = a + b I + c |grad I|^2: read noise, shot noise, and misregistered edges; each from quantiles of this pair.
     """
@@ -151,14 +154,14 @@ def _noise(rise: Image, registration: ImageAlignment) -> Image:
     c = 0.0
     if steep.sum() > 50:
         excess = change[steep] ** 2 - (a + b * level[steep])
-        # The lower quartile, 0.10 of chi-square 1, is the median of the clean half when glare moved over the other.
+        # The lower quartile, 0.10 for chi-square with 1 degree, holds even if glare has moved over half of the edges.
         c = max(float(np.quantile(excess / slope[steep], 0.25)) / 0.2, 0.0)
     variance = np.maximum(a + b * np.clip(base, 0.0, 255.0), 0.05) + max(c, 0.01) * slope2
     return np.asarray(np.sqrt(variance), np.float32)
 
 
 def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, float]:
-    """Variance a + b * level of the change, from the median absolute deviation in bands of brightness."""
+    """Return a, b of the variance a + b * level of the change, from median absolute deviations in bands of level."""
     order = np.argsort(level)
     bands = [part for part in np.array_split(order, 8) if len(part) >= 30]
     overall = (1.4826 * float(np.median(np.abs(change - np.median(change))))) ** 2
@@ -169,7 +172,9 @@ def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, floa
     if np.ptp(x) < 10.0:
         return max(overall, 0.05), 0.0
     i, j = np.triu_indices(len(x), 1)
-    b = max(float(np.median((y[j] - y[i]) / np.maximum(x[j] - x[i], 1.0))), 0.0)  # Theil-Sen: glare spoils some bands
+    b = max(
+        float(np.median((y[j] - y[i]) / np.maximum(x[j] - x[i], 1.0))), 0.0
+    )  # Theil-Sen, robust to bands with glare
     return max(float(np.median(y - b * x)), 0.05), b
 
 
@@ -178,9 +183,11 @@ class _Region:
     """One blob.
 
     Attributes:
-        pixels, weights: (n, 2) coordinates and (n,) coverage 0..1.
-        top: rise in the middle. sigma: noise.
-        rim: width of the fall from 3/4 to 1/4 of the top over the radius; 0.8 for a Gaussian bump, less for a lamp.
+        pixels, weights: (n, 2) coordinates and (n,) coverage 0 to 1.
+        top: rise in the middle.
+        sigma: standard deviation of the noise.
+        rim: width of the decrease from 3/4 to 1/4 of the top, over the radius; 0.8 for a Gaussian bump, less for a
+        lamp.
         surround: unevenness of the rise just outside, over the top; 0 for a lamp, more for a piece of glare.
     """
 
@@ -193,7 +200,7 @@ class _Region:
 
 
 def _grow(rise: Image, sigma: Image, inside: NDArray[np.bool_], diameter: float) -> list[_Region]:
-    """Lamp-like parts of the connected regions that stand out of the noise."""
+    """Return the lamp-like parts of the connected regions that stand out of the noise."""
     regions = []
     margin = 8
     seeds = _seeds(rise, (rise > SEED_SIGMAS * sigma) & inside, diameter)
@@ -212,7 +219,7 @@ def _grow(rise: Image, sigma: Image, inside: NDArray[np.bool_], diameter: float)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Seed:
-    """A connected part: its place in the image, its mask, the sum of its rise."""
+    """A connected part: its position in the image, its mask, and the sum of its rise."""
 
     left: int
     top: int
@@ -221,9 +228,10 @@ class _Seed:
 
 
 def _seeds(rise: Image, lit: NDArray[np.bool_], diameter: float) -> list[_Seed]:
-    """Connected parts that are neither specks nor streaks; what is too large for a lamp is split at half its height.
+    """Return connected parts that are neither specks nor streaks.
 
-    Glow that joins a lamp with its surroundings is lower than the lamp, so splitting frees the lamp and drops the glow.
+    Those too large for a lamp are split at half their height. The glow that connects a lamp with its surroundings is
+    lower than the lamp, so splitting separates the lamp.
     """
     import cv2
 
@@ -250,11 +258,15 @@ def _seeds(rise: Image, lit: NDArray[np.bool_], diameter: float) -> list[_Seed]:
 
 
 def _region(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[int, int]) -> _Region | None:
+    """Measure the lamp in a connected part; None if it is too small, or only the rim of something brighter.
+
+    `corner`: column and row at which the window `rise` begins in the image.
+    """
     core = lamp_core(rise, seed)
     if core is None or core.weights.sum() < LEAST_AREA_PX:
         return None
     if core.top > 1.3 * level_at(rise[seed], 0.99):
-        return None  # a rim of something brighter, which has a seed of its own
+        return None  # the rim of something brighter, which has its own seed
     rows, columns = np.nonzero(core.weights > 0.05)
     rim, surround = _edge_quality(rise, core)
     return _Region(
@@ -268,7 +280,7 @@ def _region(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[in
 
 
 def _edge_quality(rise: Image, core: Core) -> tuple[float, float]:
-    """`rim` and `surround` of a region."""
+    """Return `rim` and `surround` of a region."""
     import cv2
 
     square = np.ones((3, 3), np.uint8)
@@ -283,6 +295,7 @@ def _edge_quality(rise: Image, core: Core) -> tuple[float, float]:
 
 
 def _describe(regions: list[_Region], sigma: Image, registration: ImageAlignment) -> LightBlobs:
+    """Return the regions as blobs, best first."""
     rows = [row for row in map(_measure, regions) if row[4] >= LEAST_ASPECT]
     rows.sort(key=lambda row: -row[6])
     rows = rows[:MOST_BLOBS]
@@ -296,7 +309,7 @@ def _describe(regions: list[_Region], sigma: Image, registration: ImageAlignment
 
 
 def _measure(region: _Region) -> tuple[Array, Array, float, float, float, float, float]:
-    """Centre, its covariance, area, contrast, aspect, fill and score of one region."""
+    """Return centre, its covariance, area, contrast, aspect, fill and score of one region."""
     w, area = region.weights, float(region.weights.sum())
     centre = w @ region.pixels / area
     e = region.pixels - centre
@@ -304,13 +317,13 @@ def _measure(region: _Region) -> tuple[Array, Array, float, float, float, float,
     low, high = np.linalg.eigvalsh(moments)
     aspect = float(np.sqrt(max(low, 1e-3) / max(high, 1e-3)))
     fill = area / (4.0 * np.pi * np.sqrt(max(low * high, 1e-6)))  # a uniform ellipse has area 4 pi sqrt(det moments)
-    # d centre = sum e dw / area with dw = noise / top; smoothing ties about three neighbours together, hence the 3.
+    # d centre = sum e dw / area with dw = noise / top; the factor 3 is because smoothing correlates neighbours.
     covariance = 3.0 * (region.sigma / region.top / area) ** 2 * (e.T @ e) + CENTRE_FLOOR_PX**2 * np.eye(2)
     sigmas = region.top / region.sigma
     clear = min(sigmas / CLEAR_SIGMAS, 1.0) * min(sigmas * np.sqrt(area) / CLEAR_BLOB_SIGMAS, 1.0)
     round_ = min(aspect / 0.5, 1.0)
     full = float(np.exp(-0.5 * ((fill - 0.96) / 0.1) ** 2))
     sharp = float(np.exp(-0.5 * (max(region.rim - 0.4, 0.0) / 0.15) ** 2))
-    # A lamp lights the plate round it, up to 0.55 of its own rise where the image saturates; glare has no plateau.
+    # A lamp lights the plate around it, by up to 0.55 of its own rise if the image saturates; glare has no plateau.
     alone = float(np.exp(-0.5 * (max(region.surround - 0.55, 0.0) / 0.15) ** 2))
     return centre, covariance, area, region.top, aspect, fill, clear * round_ * full * sharp * alone

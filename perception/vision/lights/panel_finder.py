@@ -1,4 +1,4 @@
-"""The panel's pose from two images of it, with lights off and on (paper, Section II-B, Fig. 5)."""
+"""Pose of the panel from two images of it, with its lights off and on (paper, Section II-B, Fig. 5)."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from perception.vision.lights.find import LightBlobs, find_lights
 from perception.vision.quadrangle import QuadranglePose, estimate
 from perception.vision.quadrangle import warm_up as warm_up_quadrangle
 
-MODEL_SIGMA_PX = 0.15  # what a usual lens model adds to each coordinate of a light
-WRONG_FIT_P = 1e-4  # a worse fit than one in ten thousand means a wrong lamp, panel file or lens
+MODEL_SIGMA_PX = 0.15  # contribution of a usual lens model to the standard deviation of a light's coordinate
+WRONG_FIT_P = 1e-4  # if a worse fit is less probable than this, a lamp, the panel file or the lens is wrong
 NEAREST_M = 0.05
-CORNER = 1.75  # the tolerances bound each axis; their corners lie a factor sqrt(3) further out
+# Factor of the largest distance, because the tolerances are per axis and their corners are sqrt(3) times as far.
+CORNER = 1.75
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PanelPrior:
-    """What is known of the panel's pose before its lights are looked for.
+    """Prior knowledge of the panel's pose.
 
     Attributes:
         camera_from_panel: a rough pose: which way is up, and how far away the panel is.
-        camera_from_expected: where the panel must be, within the tolerances on each axis; None: anywhere.
+        camera_from_expected: expected pose, with tolerances on each axis; None if the panel may be anywhere.
     """
 
     camera_from_panel: RigidTransform
@@ -40,7 +41,7 @@ class PanelPrior:
     angle_tolerance_rad: float = np.inf
 
     def allows(self, camera_from_panel: RigidTransform) -> bool:
-        """Return whether the panel can be there."""
+        """Return whether the prior allows the pose."""
         offset = self.offset(camera_from_panel)
         return bool(
             np.linalg.norm(offset[:3]) <= CORNER * self.position_tolerance_m
@@ -48,7 +49,7 @@ class PanelPrior:
         )
 
     def offset(self, camera_from_panel: RigidTransform) -> Array:
-        """(6,) from where the panel is expected: translation, then rotation."""
+        """Return the difference (6,) from the expected pose: translation, then rotation."""
         if self.camera_from_expected is None:
             return np.zeros(6)
         return difference(camera_from_panel, self.camera_from_expected)
@@ -65,7 +66,7 @@ class FoundPanel:
         camera_from_panel: its pose with the covariance of image noise, lens and lamps.
         lights: which blobs are its lights.
         covariance_px: (4, 2, 2) of each light's pixel, lens and lamps included.
-        pose: everything that the image says of the pose: fit, mirror poses, odds.
+        pose: result of `estimate`: fit, mirror poses, odds.
     """
 
     camera_from_panel: UncertainPose
@@ -86,21 +87,21 @@ def find_panel(
 ) -> FoundPanel:
     """Find the panel in one image with its lights off and one with its lights on.
 
-    Of several poses that the image allows, the one is taken that the prior allows.
+    If the image allows several poses, the one that the prior allows is returned.
 
     Args:
-        image_off, image_on: (H, W) gray or (H, W, 3) RGB, 8 bit, of the size that `intrinsics` names.
-        lights_m: (4, 3) places of the lights in the panel's frame, m.
-        lens_rms_px: how well the lens model fits.
-        light_sigma_m: how exactly the lamps sit in the panel.
+        image_off, image_on: (H, W) gray or (H, W, 3) RGB, 8 bit, of the size of `intrinsics`.
+        lights_m: (4, 3) positions of the lights in the panel's frame, m.
+        lens_rms_px: root mean square error of the lens model.
+        light_sigma_m: standard deviation of the lamps' positions in the panel.
 
     Raises:
         CameraMoved: the two images do not show the same view.
-        LightMissing: not all four lights are seen.
-        WrongLamp: the bright blobs do not stand as the taught lights.
-        NotFound: they stand where the panel cannot be.
+        LightMissing: not all four lights are visible.
+        WrongLamp: the bright blobs are not arranged like the taught lights.
+        NotFound: the pose is not one that the prior allows.
         Ambiguous: two choices of blobs, or two poses, fit equally well.
-        InvalidRequest: not images, or another size than the calibration.
+        InvalidRequest: not images, or of another size than the calibration.
     """
     lights = find_panel_lights(image_off, image_on, lights_m, intrinsics, upright=matrix_of(prior.camera_from_panel))
     distance_m = float(prior.camera_from_panel.translation[2])
@@ -137,7 +138,7 @@ def find_panel_lights(
 
 
 def warm_up() -> None:
-    """Compile (or load from the cache) what `find_panel` needs, so that the first real call is as fast as any."""
+    """Compile the kernels of `find_panel`, or load them from the cache, so that its first call is fast."""
     warm_up_quadrangle()
     lights = np.array([[-0.2, 0.1, 0.0], [0.2, 0.1, 0.0], [0.2, -0.1, 0.0], [-0.2, -0.1, 0.0]])
     centres = np.array([[120.0, 140.0], [520.0, 140.0], [520.0, 340.0], [120.0, 340.0]])
@@ -150,7 +151,7 @@ def warm_up() -> None:
 
 
 def _plausible(pose: QuadranglePose, prior: PanelPrior) -> UncertainPose:
-    """The pose that the prior allows, provided that there is exactly one."""
+    """Return the pose that the prior allows, if there is exactly one."""
     candidates = [(pose.camera_from_object, pose.covariance)]
     if pose.ambiguous and prior.camera_from_expected is not None:
         candidates += [(a.camera_from_object, a.covariance) for a in pose.alternatives if a.covariance is not None]

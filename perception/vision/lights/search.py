@@ -9,22 +9,23 @@ from hal.arrays import Array
 from hal.jit import compiled, inlined
 from perception.vision.quadrangle.three_point import three_point
 
-SIZE_SPREAD = 0.2  # standard deviation of log diameter among equal lamps
-CONTRAST_SPREAD = 0.6  # of log contrast: uneven light, ageing, angle
-RADIUS_SPREAD = 0.5  # of the log of the lamps' radius about the taught or usual one
-MISSING_INSIDE = 2.0  # what a light inside the image costs that is not seen
-MISSING_OUTSIDE = 1.0  # ... and outside, plus the next figure for every image width that it is outside
-OUTSIDE_PER_WIDTH = 20.0
-ROUNDER = 0.2  # a disc tilted by t has aspect cos t; blur makes it rounder by this much
-UNCHECKED = 3.0  # three points fit always: what a hypothesis without a fourth light to check it costs
-FARTHEST_MISS2 = 16.0  # squared, in standard deviations: a blob farther from the fourth light's place is another thing
-UNLIKE = 1.2  # log ratio of diameters above which two blobs are not equal lamps at any tilt
+SIZE_SPREAD = 0.2  # standard deviation of the log diameter among equal lamps
+CONTRAST_SPREAD = 0.6  # of the log contrast, because of uneven light, ageing and viewing angle
+RADIUS_SPREAD = 0.5  # of the log radius about the taught or usual one
+MISSING_INSIDE = 2.0  # score penalty for a light inside the image that is not visible
+MISSING_OUTSIDE = 1.0  # the same for one outside the image
+OUTSIDE_PER_WIDTH = 20.0  # additional penalty per image width by which it is outside
+ROUNDER = 0.2  # a disc tilted by t has aspect cos t; blur increases the aspect by about this
+UNCHECKED = 3.0  # penalty for a hypothesis without a fourth light, because three points always fit
+# Squared, in standard deviations; a blob farther from the predicted place is not the fourth light.
+FARTHEST_MISS2 = 16.0
+UNLIKE = 1.2  # log ratio of diameters above which two blobs cannot be equal lamps at any tilt
 SHOWN_WIDTH = 1.7725  # a lamp of radius r shows sqrt(area) = sqrt(pi) r f / z
 
 
 @inlined
 def spread(values: Array, n: int) -> float:
-    """Sum of squared deviations of the first n values from their mean."""
+    """Return the sum of squared deviations of the first n values from their mean."""
     mean = 0.0
     for i in range(n):
         mean += values[i] / n
@@ -36,7 +37,7 @@ def spread(values: Array, n: int) -> float:
 
 @inlined
 def rays_of(centres: Array, camera: Array) -> Array:
-    """(n, 3) unit rays through ideal pixels."""
+    """Return unit rays (n, 3) through ideal pixels."""
     rays = np.empty((centres.shape[0], 3))
     for i in range(centres.shape[0]):
         u, v = (centres[i, 0] - camera[2]) / camera[0], (centres[i, 1] - camera[3]) / camera[1]
@@ -47,14 +48,14 @@ def rays_of(centres: Array, camera: Array) -> Array:
 
 @inlined
 def turns(centres: Array, i: int, j: int, k: int) -> float:
-    """Twice the signed area of three blobs: its sign tells in which sense they follow each other."""
+    """Return twice the signed area of the triangle of three blobs; its sign is that of their orientation."""
     ij, ik = centres[j] - centres[i], centres[k] - centres[i]
     return float(ij[0] * ik[1] - ij[1] * ik[0])
 
 
 @compiled
 def pose_score(R: Array, upright: Array, roundness: float, prior: Array) -> float:
-    """Score penalty of a rotation for tilt and roll, and for lamps that look rounder than it predicts."""
+    """Return the score penalty of a rotation for tilt and roll, and for lamps that look rounder than it predicts."""
     Q = R @ upright.T
     tilt = np.arccos(min(1.0, max(-1.0, Q[2, 2])))
     roll = np.arctan2(Q[1, 0] - Q[0, 1], Q[0, 0] + Q[1, 1])
@@ -64,13 +65,13 @@ def pose_score(R: Array, upright: Array, roundness: float, prior: Array) -> floa
 
 @inlined
 def alike(sizes: Array, contrasts: Array, n: int) -> float:
-    """Score penalty for differences in size and contrast among the first n lamps."""
+    """Return the score penalty for differences in size and contrast among the first n lamps."""
     return -0.5 * (spread(sizes, n) / SIZE_SPREAD**2 + spread(contrasts, n) / CONTRAST_SPREAD**2)
 
 
 @inlined
 def unseen(u: float, v: float, frame: Array) -> float:
-    """Score penalty for a fourth light that is not seen at its predicted place."""
+    """Return the score penalty for a fourth light that is not visible at its predicted place."""
     beyond = max(-u, u - frame[0], 0.0) + max(-v, v - frame[1], 0.0)
     missing = MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / frame[0] if beyond > 0.0 else MISSING_INSIDE
     return -UNCHECKED - missing
@@ -89,11 +90,13 @@ def choose_fourth(
     sizes: Array,
     contrasts: Array,
 ) -> float:
-    """The blob that serves best as the light `omit`, put into `order` (-1: none does); returns its score.
+    """Find the best blob for the light `omit` and write it into `order` (-1 if none is better than none).
+
+    Returns the score.
 
     Args:
-        q: (3,) where the light must be, camera frame.
-        sizes, contrasts: (4,) of the other three lamps, log; the last place is used here.
+        q: (3,) predicted position of the light, camera frame.
+        sizes, contrasts: (4,) logarithms for the other three lamps; the last entry is used here.
     """
     u, v = camera[0] * q[0] / q[2] + camera[2], camera[1] * q[1] / q[2] + camera[3]
     score = unseen(u, v, frame) + alike(sizes, contrasts, 3)
@@ -123,17 +126,22 @@ def search(
     best: Array,
     chosen: NDArray[np.int64],
 ) -> None:
-    """The best hypotheses, highest score first, into best (M,) and chosen (M, 4) (-1 = not seen).
+    """Find the best hypotheses and insert them, highest score first, into best (M,) and chosen (M, 4).
+
+    -1 = not visible.
 
     Args:
-        centres: (n, 2) ideal pixels. traits: (4, n) reward, log diameter, log contrast and aspect of the candidates.
-        X: (4, 3) lights in the panel's frame. upright: (3, 3) expected camera_from_panel rotation.
-        camera: fx, fy, cx, cy. frame: width, height.
+        centres: (n, 2) ideal pixels.
+        traits: (4, n) reward, log diameter, log contrast and aspect of the candidates.
+        X: (4, 3) lights in the panel's frame.
+        upright: (3, 3) expected camera_from_panel rotation.
+        camera: fx, fy, cx, cy.
+        frame: width, height.
         prior: standard deviations of tilt (rad), roll (rad) and of the fourth light's place (px); lamp radius (m).
         omit: the light that is predicted from the other three.
 
-    Score = sum of rewards - sum of squares / 2 of size and contrast spread, tilt, roll, roundness and the fourth
-    light's miss.
+    The score is the sum of the rewards minus half the squared deviations, in standard deviations, of sizes, contrasts,
+    tilt, roll, roundness and the fourth light's place.
     """
     n = centres.shape[0]
     reward, log_size = traits[0], traits[1]
@@ -158,7 +166,7 @@ def search(
                     continue
                 base = reward[i] + reward[j] + reward[k]
                 if base + most <= best[best.shape[0] - 1]:
-                    continue  # everything else only costs
+                    continue  # all other terms are negative
                 f[0], f[1], f[2] = rays[i], rays[j], rays[k]
                 order[names[0]], order[names[1]], order[names[2]] = i, j, k
                 try_triple(
@@ -184,7 +192,10 @@ def try_triple(
     best: Array,
     chosen: NDArray[np.int64],
 ) -> None:
-    """Score every pose that three blobs allow, each with the fourth blob that suits it best."""
+    """Score every pose that three blobs allow, each with the best fourth blob.
+
+    P: (3, 3) the lights `names` in the panel's frame; f: (3, 3) rays to their blobs; base: sum of their rewards.
+    """
     Rs, ts = np.empty((4, 3, 3)), np.empty((4, 3))
     sizes, contrasts = np.empty(4), np.empty(4)
     usual = np.log(SHOWN_WIDTH * prior[3] * camera[0])
@@ -206,7 +217,7 @@ def try_triple(
 
 @compiled
 def insert(score: float, order: NDArray[np.int64], best: Array, chosen: NDArray[np.int64]) -> None:
-    """Insert a hypothesis into the list of the best ones, where each set of blobs occurs once."""
+    """Insert a hypothesis into the list of the best ones, which contains each choice of blobs once."""
     m = best.shape[0]
     if score <= best[m - 1]:
         return

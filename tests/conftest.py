@@ -1,4 +1,4 @@
-"""One setting for all: property tests try the same examples in every run, so that a red run is red again."""
+"""Settings of all tests: property tests try the same examples in every run, so that failures are reproducible."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ settings.load_profile("repeatable")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with long tests first: processes that share the files then end together."""
+    """Run files with long tests first, so that processes that share the files end at about the same time."""
     long = {item.path for item in items if item.get_closest_marker("slow") or item.get_closest_marker("wire")}
     items.sort(key=lambda item: item.path not in long)

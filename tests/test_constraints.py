@@ -1,4 +1,4 @@
-"""`constraints.txt` pins what `make setup` installs, each package at the version that is installed, and nothing else."""
+"""`constraints.txt` pins exactly the packages that `make setup` installs, at the installed versions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The faces of the wings: few names, each there and used, none that hides a module, and none that type checkers make up."""
+"""The packages' public names are few, exist, are used, hide no module, and are known to type checkers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ IMPORT = re.compile(r"from ([\w.]+) import (\([^)]*\)|[^\n]*)")
 
 
 def _used() -> Iterator[str]:
-    """What users import from faces, as `face.name`, and what they take from a module by a dot."""
+    """Return the names that users import from packages, as `package.name`, including access by a dot."""
     for folder, ending in (("service", "py"), ("examples", "py"), ("docs", "md")):
         for path in (ROOT / folder).rglob(f"*.{ending}"):
             text = path.read_text(encoding="utf-8")

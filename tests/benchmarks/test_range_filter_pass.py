@@ -1,4 +1,4 @@
-"""The filter pass, the unit of times, finds the curvature and normals of a ball and a plane."""
+"""The filter pass, which is the unit of time, finds the curvature and normals of a ball and a plane."""
 
 from __future__ import annotations
 

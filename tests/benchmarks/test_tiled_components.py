@@ -1,4 +1,4 @@
-"""Components are those of scipy, for any number of tiles."""
+"""The components equal those of scipy for any number of tiles."""
 
 from __future__ import annotations
 

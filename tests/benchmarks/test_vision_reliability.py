@@ -1,4 +1,4 @@
-"""The reliability diagram tells honest confidences from lies."""
+"""The reliability diagram distinguishes correct confidences from wrong ones."""
 
 from __future__ import annotations
 

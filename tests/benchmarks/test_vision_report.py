@@ -1,4 +1,4 @@
-"""The lines for best guesses say what was right beside what was expected."""
+"""The lines for best guesses state the fractions right beside the expected ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def everything_right(confidence: float) -> list[dict[str, Any]]:
 
 
 def line(lines: list[str], what: str) -> tuple[list[float], list[float]]:
-    """The figures of a line before and after the word `expected`."""
+    """Return the figures of a line before and after the word `expected`."""
     found = next(text for text in lines if what in text).split(what)[1]
     right, expected = (part.replace("/", " ").split() for part in found.split("expected"))
     return [float(value) for value in right], [float(value) for value in expected]
@@ -39,7 +39,7 @@ def test_what_is_refused_nevertheless_is_wrong_and_expects_nothing() -> None:
 
 
 def test_the_least_sure_are_refused_first_whatever_their_kind() -> None:
-    rows = [*everything_right(0.9) * 8, *[row(error=100.0, confidence=0.1)] * 5]  # 101, of which 5 % are 5
+    rows = [*everything_right(0.9) * 8, *[row(error=100.0, confidence=0.1)] * 5]  # 101 rows, of which 5 % are 5
     assert line(guess_lines(rows), "are refused") == ([0.0], [pytest.approx(0.1)])
     rows += [row(error=100.0, confidence=0.1, cls="gauge")]
     assert line(guess_lines(rows), "are refused")[0] == [pytest.approx(1 / 97, abs=1e-3)]

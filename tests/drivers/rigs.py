@@ -1,4 +1,4 @@
-"""Rigs of wired devices: an emulator, the driver that it answers, and the means to break the wire."""
+"""Test rigs of devices on links: an emulator, its driver, and functions that disturb the link."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ CLOCK = WallClock()
 
 
 def soon(duration_s: float = 1.0) -> Deadline:
-    """A deadline on the wall's clock."""
+    """Return a deadline on the wall clock."""
     return Deadline.after(CLOCK, duration_s)
 
 
 def later(duration_s: float = 1.0) -> float:
-    """The time, in seconds of the links' clock, until which something may last."""
+    """Return a time limit on the clock of the links, in seconds."""
     return now_s() + duration_s
 
 
 class ScriptLink:
-    """A link whose far side is a list: each write moves the next answer into the receive buffer."""
+    """Link with a list of answers; each write moves the next answer into the receive buffer."""
 
     name = "script"
     byte_s = 0.0
@@ -55,7 +55,7 @@ class ScriptLink:
 
 
 def until(condition: Callable[[], bool], within_s: float = 5.0) -> None:
-    """Look again and again until `condition` holds; fails when it never does."""
+    """Wait until `condition` holds; fail if it never does."""
     give_up = soon(within_s)
     rest = threading.Event()
     while not condition():
@@ -64,7 +64,7 @@ def until(condition: Callable[[], bool], within_s: float = 5.0) -> None:
 
 
 def count_good(device: Any, is_true: Callable[[Any], bool], *, wanted: int = 5, within_s: float = 8.0) -> int:
-    """Take fresh samples over a bad wire until `wanted` came; each must be true, each error typed and named."""
+    """Read samples over a faulty link until `wanted` have come; all must be true, and errors must name the device."""
     give_up = soon(within_s)
     rest = threading.Event()
     good = 0
@@ -83,7 +83,7 @@ def count_good(device: Any, is_true: Callable[[Any], bool], *, wanted: int = 5, 
 
 @contextmanager
 def wired(emulator: WireEmulator, driver: str, options: dict[str, Any] | None = None) -> Iterator[Any]:
-    """The real driver connected to an emulator that is already running; both are closed at the end."""
+    """Yield the real driver connected to a running emulator; both are closed at the end."""
     device = None
     try:
         device = connect(Context(name="wired"), driver, {**emulator.address, **(options or {})})
@@ -98,6 +98,6 @@ def wired(emulator: WireEmulator, driver: str, options: dict[str, Any] | None = 
 def wired_rig(
     emulator: WireEmulator, driver: str, options: dict[str, Any] | None = None, *, sample_period_s: float = 0.1
 ) -> Iterator[Rig[Any]]:
-    """A rig for the conformance kit."""
+    """Return a rig for the conformance tests."""
     with wired(emulator, driver, options) as device:
         yield Rig(device=device, clock=CLOCK, sample_period_s=sample_period_s, inject=emulator.inject)

@@ -1,4 +1,4 @@
-"""Wrong devices, wrong ids, vanishing ports: typed errors that name the device, the port and what to do."""
+"""Wrong devices, wrong ids and vanishing ports raise typed errors that name the device, the port and the remedy."""
 
 import random
 import threading
@@ -18,7 +18,7 @@ from tests.drivers.rigs import soon, wired
 
 
 def refusal(name: str, driver: str, options: dict[str, Any]) -> DeviceUnavailable:
-    """The error of a connection that must fail."""
+    """Return the error of a connection that must fail."""
     with pytest.raises(DeviceUnavailable) as caught:
         connect(Context(name=name), driver, options)
     return caught.value
@@ -105,7 +105,7 @@ NETWORK: dict[str, dict[str, Any]] = {
 
 
 class Chatter:
-    """A far side that is no device: it answers nothing, talks noise, or hangs up on whoever connects."""
+    """Server that is not a device: it does not answer, sends noise, or closes every connection."""
 
     def __init__(self, port: FarPort, way: str) -> None:
         self.port = port
@@ -125,7 +125,7 @@ class Chatter:
                 self.port.appear()
 
     def close(self) -> None:
-        """End it."""
+        """End the server."""
         self._ending.set()
         self._thread.join()
         self.port.close()
@@ -139,7 +139,7 @@ def test_every_serial_driver_says_what_is_wrong_with_its_port(
     way: str, hint: str, caplog: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for driver_file in ("cia402.arm", "dynamixel.arm", "dynamixel.gripper", "lms200"):
-        monkeypatch.setattr(f"drivers.{driver_file}.CONNECT_S", 3.0)  # as long as the others try
+        monkeypatch.setattr(f"drivers.{driver_file}.CONNECT_S", 3.0)  # as for the other drivers
     with ExitStack() as stack, ThreadPoolExecutor(len(SERIAL)) as pool:
         waiting = {}
         for driver, options in SERIAL.items():
@@ -172,7 +172,7 @@ def test_every_network_driver_names_the_address(way: str, caplog: Any) -> None:
 
 
 class OldController:
-    """A UR controller that knows version 1 of RTDE alone."""
+    """UR controller that supports version 1 of RTDE only."""
 
     def __init__(self) -> None:
         self.port = TcpPort()
@@ -188,7 +188,7 @@ class OldController:
                     self.port.send(peer, rtde.package(kind, b"\x00"))
 
     def close(self) -> None:
-        """End it."""
+        """End the controller."""
         self._ending.set()
         self._thread.join()
         self.port.close()

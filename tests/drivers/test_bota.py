@@ -1,4 +1,4 @@
-"""Bota SensONE: conformance, clock wrap, status bits, restart, faults."""
+"""Tests of the Bota SensONE: conformance, clock wrap, status bits, restart, faults."""
 
 import math
 import struct
@@ -116,7 +116,7 @@ def test_a_sensor_that_restarts_is_set_up_again() -> None:
 
 
 class Sensor(ScriptLink):
-    """A sensor that reads commands as they are, or line by line."""
+    """Sensor that accepts commands only with a line end or, if not `reads_lines`, only without one."""
 
     def __init__(self, *, reads_lines: bool, refuses: str = "-") -> None:
         super().__init__()

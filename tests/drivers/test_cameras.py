@@ -1,4 +1,4 @@
-"""Cameras and depth cameras out of files, and the V4L2 driver over a faked grabber."""
+"""Tests of cameras and depth cameras that play files, and of the V4L2 driver with a fake grabber."""
 
 import threading
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ class TestDepthCamera(RangeScannerContract):
 
 
 class FakeGrabber:
-    """Gives frames that count, until told to fail or to block."""
+    """Returns numbered frames until told to fail or to block."""
 
     def __init__(self) -> None:
         self.frames = 0

@@ -1,4 +1,4 @@
-"""FT 300 as talker and as Modbus slave: conformance, values, faults, and minimal independent decoding."""
+"""Tests of the FT 300, streaming and as Modbus slave: conformance, values, faults, independent decoding."""
 
 import struct
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ class TestFt300(ForceTorqueContract):
 
 
 def is_a_true_wrench(value: Wrench, reads: int) -> bool:
-    """Was it one of the scripted device's last readings, all six components of the same one?"""
+    """Return whether all six components are of the same one of the scripted device's latest readings."""
     index = round(value.force_n[0] / 0.01)
     true = scripted_wrench(index)
     return (

@@ -1,4 +1,4 @@
-"""SICK LMS 200: conformance, baud search, exact scans, codes, faults, the quick manual's frames."""
+"""Tests of the SICK LMS 200: conformance, baud search, exact scans, codes, faults, frames of the quick manual."""
 
 import math
 from collections.abc import Iterator
@@ -82,7 +82,7 @@ def test_codes_are_no_distances_and_units_are_the_telegrams() -> None:
     payload = b"\xb0" + (3 | 1 << 14).to_bytes(2, "little") + bytes.fromhex("e803 f71f fe3f")
     np.testing.assert_allclose(decode_scan(payload), [1.0, math.nan, math.nan])
     payload = b"\xb0" + (2).to_bytes(2, "little") + bytes.fromhex("6400 64e0")
-    np.testing.assert_allclose(decode_scan(payload), [1.0, 1.0])  # centimetres; flags above 13 bits do not count
+    np.testing.assert_allclose(decode_scan(payload), [1.0, 1.0])  # centimetres; bits above 13 are flags
 
 
 @pytest.mark.parametrize("length", range(1, 6))
@@ -105,7 +105,7 @@ STOPPED = telegram(b"\xa0\x00\x10", address=0x80)
 
 
 def scan(millimetres: int, *, status: int = 0, count: int = 181) -> bytes:
-    """A scan telegram, all beams alike."""
+    """Return a scan telegram with equal beams."""
     head = b"\xb0" + (count | 1 << 14).to_bytes(2, "little")
     return telegram(head + count * millimetres.to_bytes(2, "little") + bytes([status]), address=0x80)
 
@@ -132,7 +132,7 @@ def test_a_false_header_does_not_make_a_true_scan_wait_for_the_bytes_it_promises
 
 
 class Scanner(ScriptLink):
-    """Acknowledges each request, and answers those who wait long enough for it."""
+    """Scanner that acknowledges each request, and answers if the reader waits for long enough."""
 
     def __init__(self, answer: bytes, *, takes_s: float) -> None:
         super().__init__()
@@ -161,7 +161,7 @@ def test_an_answer_behind_a_false_header_is_found() -> None:
 
 
 class Repeater(ScriptLink):
-    """Loses the first request's time: both answers come after the second."""
+    """Scanner that misses the time-out of the first request, so both answers come after the second request."""
 
     def read(self, until_s: float) -> bytes:
         first, self.ready = self.ready[: len(STOPPED)], self.ready[len(STOPPED) :]

@@ -1,4 +1,4 @@
-"""Cells on the wire differ from the simulated ones in backends alone, and their wired devices find their emulators."""
+"""Cells with real drivers differ from the simulated ones in the backends only, and the drivers find their emulators."""
 
 import tomllib
 from pathlib import Path
@@ -34,7 +34,7 @@ def table(name: str) -> dict[str, Any]:
 
 
 def without_backend(cell: dict[str, Any]) -> dict[str, Any]:
-    """A cell file without what may differ between backends."""
+    """Return a cell file without the parts that may differ between backends."""
     cell.pop("emulators", None)
     cell["cell"].pop("mode")
     cell["cell"].pop("name")
@@ -55,7 +55,7 @@ def test_only_mode_drivers_options_and_emulators_differ(name: str) -> None:
 
 @pytest.mark.parametrize("name", WIRED)
 def test_wired_devices_connect_to_their_emulators(name: str) -> None:
-    """As the cell process does it, with scripted devices in the simulator's place."""
+    """Connect as the cell process does, with scripted devices instead of the simulator."""
     cell = load_cell(CELLS / name)
     for device_name, section in cell.file.emulators.items():
         wanted = cell.file.devices[device_name]
@@ -82,7 +82,7 @@ def test_the_emulators_are_registered() -> None:
 
 @pytest.mark.parametrize("mode", ["mixed", "real"])
 def test_only_a_real_cell_takes_older_states_than_the_driver_would(mode: str) -> None:
-    """Beside a simulated world a late state is waited for: one 0.1 s old would let the arm be 25 mm behind."""
+    """With a simulated world the age limit is short, because the arm would be 25 mm away from a state 0.1 s old."""
     cell = load_cell(CELLS / "wire-ur.toml")
     parts = cell.file.model_copy(update={"cell": cell.file.cell.model_copy(update={"mode": mode})})
     far_side = emulator_factory("ur")(scripted.ScriptedArm(), {"rate_hz": 125.0})

@@ -1,4 +1,4 @@
-"""Remote I/O: the conformance kit over TCP and RTU, one bus for several devices, faults, pymodbus opposite."""
+"""Tests of remote I/O: conformance over TCP and RTU, several devices on one bus, faults, pymodbus as client."""
 
 import math
 from collections.abc import Iterator
@@ -59,7 +59,7 @@ def test_no_fault_of_the_wire_gives_wrong_feedback(fault: str, transport: str) -
             try:
                 device.set_on(wanted, deadline=soon())
             except DeviceTimeout:
-                continue  # said so, which is right
+                continue  # an error was reported, as it should be
             assert lights.on == wanted
             try:
                 assert device.read_on(deadline=soon()).value == wanted
@@ -162,7 +162,7 @@ def test_a_host_alone_is_modbus_tcp_at_its_usual_port_and_no_address_is_refused(
 
 
 def test_pymodbus_proves_the_emulator(transport: str) -> None:
-    """Other people's client reads what the map of the notes promises."""
+    """A third-party client reads the registers that the notes describe."""
     lights = ScriptedLights()
     far_side = emulator.start(lights, {"transport": transport})
     if transport == "tcp":

@@ -1,4 +1,4 @@
-"""Net F/T: conformance over UDP, sequence rules, status, faults."""
+"""Tests of the Net F/T: conformance over UDP, sequence rules, status, faults."""
 
 import itertools
 import socket
@@ -34,7 +34,7 @@ def record(sequence: int, fx: int, status: int = 0) -> bytes:
 
 
 def lonely() -> Netft:
-    """A driver that is fed by hand."""
+    """Return a driver without link; the test passes it the records."""
     return Netft(Context(name="wrist"), NetftOptions(host="127.0.0.1", port=1))
 
 

@@ -1,4 +1,4 @@
-"""Robotiq 2F: conformance, activation, grip, faults of gripper and wire, the manual's frames."""
+"""Tests of the Robotiq 2F: conformance, activation, grip, faults of gripper and link, frames of the manual."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -42,12 +42,12 @@ def test_it_grips_and_holds() -> None:
 
 
 def test_the_old_moves_result_is_not_taken_for_the_new_ones() -> None:
-    """Until the gripper echoes the new position, it counts as moving."""
+    """The gripper counts as moving until it echoes the new position."""
     far_side = emulator.start(ScriptedGripper(object_m=0.02), {})
     with wired(far_side, DRIVER) as device:
         device.command(width_m=0.0, force_n=50.0, speed_m_per_s=0.15, deadline=soon())
         until(lambda: device.read_state(deadline=soon()).value.is_holding)
-        device._goal = 77  # what the gripper does not echo
+        device._goal = 77  # a goal that the gripper does not echo
         state = device.newest(soon(), not_before_s=soon(0.0).at_s + 0.02).value
     assert state.is_moving and not state.is_holding
 
@@ -88,7 +88,7 @@ def test_a_gripper_that_has_started_anew_knows_no_width() -> None:
     far_side = emulator.start(ScriptedGripper(), {})
     with wired(far_side, DRIVER) as device:
         assert device.read_state(deadline=soon()).quality is Quality.VALID
-        far_side.table.write_registers(1000, [0])  # what it comes up with after it was without power
+        far_side.table.write_registers(1000, [0])  # its value after a power cycle
         sample = device.newest(soon(), not_before_s=soon(0.0).at_s + 0.05)
         assert (sample.quality, sample.cause) == (Quality.INVALID, Cause.DEVICE)
 

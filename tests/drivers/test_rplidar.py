@@ -1,4 +1,4 @@
-"""RPLIDAR: conformance, resynchronising without check sums, health, the vendor's frames."""
+"""Tests of the RPLIDAR: conformance, resynchronisation without checksums, health, frames of the manual."""
 
 import math
 from collections.abc import Iterator
@@ -99,7 +99,7 @@ def test_a_scanner_that_warns_gives_degraded_scans() -> None:
 
 @pytest.mark.parametrize(("mode", "at_once"), [("standard", 1), ("standard", 90), ("express", 64)])
 def test_a_turn_is_stamped_with_its_end_and_not_with_what_came_after_it(mode: str, at_once: int) -> None:
-    """Measurements of 0.5 ms each, so many at once: without counting back the stamps would be 4 to 45 ms late."""
+    """Measurements at 0.5 ms intervals arrive `at_once`; without correction the stamps would be 4 to 45 ms late."""
     device = Rplidar(Context(name="scanner"), RplidarOptions(port="none", mode=mode))
     nodes = emulator.encode_turn(TURN_RAD, np.full(360, 1.0)) * 6
     capsules = emulator.encode_capsules(np.full(384, 1.0), is_first=False) * 6
@@ -226,7 +226,7 @@ def test_no_fault_of_the_wire_gives_a_wrong_express_scan(fault: str) -> None:
 
 
 def _is_within(seen_m: Any, line: Any) -> bool:
-    """Each beam that was seen is near some true beam beside it: 384 measurements fall into 360 sectors."""
+    """Return whether each valid beam is near a true beam beside it, as 384 measurements fall into 360 sectors."""
     near = np.stack([np.roll(line, shift) for shift in (-2, -1, 0, 1, 2)])
     seen = np.isfinite(seen_m)
     low, high = np.nanmin(near, axis=0), np.nanmax(near, axis=0)

@@ -1,4 +1,4 @@
-"""A scaffolded driver runs and passes the kit as it is written; the example package is one, registered from outside."""
+"""A generated driver passes the conformance tests unchanged; the example package is one in a separate package."""
 
 import os
 import subprocess
@@ -29,10 +29,10 @@ TEMPLATES = {
 
 
 def run_pytest(*folders: Path, beside: tuple[Path, ...] = ()) -> subprocess.CompletedProcess[str]:
-    """The tests of packages that are not installed, in one process: its start costs more than they do.
+    """Run the tests of packages that are not installed, in one process, because its start takes longer than they do.
 
     Args:
-        beside: more folders to import from.
+        beside: further folders on the import path.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*map(str, (*folders, *beside)), str(ROOT)])}
     options = ["-v", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", str(folders[0].parent)]
@@ -127,7 +127,7 @@ def test_the_example_package_is_what_the_scaffold_writes() -> None:
 
 
 def test_the_example_package_registers_from_outside_and_passes_the_kit(tmp_path: Path) -> None:
-    """What pip would write is written by hand: the entry points of its pyproject."""
+    """The entry points of its pyproject are written by hand, in place of an installation by pip."""
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
     info = tmp_path / "acme_rangefinder-1.0.dist-info"
     info.mkdir()

@@ -1,4 +1,4 @@
-"""SCIP scanners: conformance over TCP and serial, exact scans, the manual's numbers, faults, clock wrap."""
+"""Tests of SCIP scanners: conformance over TCP and serial, exact scans, numbers of the manual, faults, clock wrap."""
 
 import math
 from collections.abc import Iterator
@@ -61,7 +61,7 @@ def test_answers_do_not_depend_on_chunks_or_noise(cuts: list[int], noise: bytes)
 
 
 def is_a_true_scan(image: RangeImage, capabilities: RangeScannerCapabilities, reads: int) -> bool:
-    """Is it, beam for beam, one of the scripted scanner's scans?"""
+    """Return whether the image equals one of the scripted scanner's scans, beam by beam."""
     angles = capabilities.first_angle_rad + capabilities.step_angle_rad * np.arange(capabilities.width)
     for index in range(max(1, reads - 40), reads + 1):
         true = line_m(RangeImage(depth_m=scripted_scan(index)), ScriptedScanner().capabilities(), angles)

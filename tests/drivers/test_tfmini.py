@@ -1,4 +1,4 @@
-"""TFmini-Plus: the conformance kit over a pty, the faults of a wire, and the manual's frames."""
+"""Tests of the TFmini-Plus: conformance over a pty, faults of the link, and frames of the manual."""
 
 import math
 from collections.abc import Iterator

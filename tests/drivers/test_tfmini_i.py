@@ -1,4 +1,4 @@
-"""TFmini-i: the conformance kit over Modbus RTU and CAN, faults of both wires, and other people's clients."""
+"""Tests of the TFmini-i: conformance over Modbus RTU and CAN, faults of both links, and third-party clients."""
 
 import struct
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Every frame of the shared vectors, through the code that the drivers use."""
+"""Checks the code of the drivers against every frame of the shared test vectors."""
 
 import json
 import struct
@@ -29,7 +29,7 @@ def of_kind(kind: str) -> Any:
 
 
 class OneAnswer:
-    """A link that notes what is written and gives one answer."""
+    """Link that stores what is written and gives one answer."""
 
     name = "vector"
     byte_s = 0.0
@@ -58,7 +58,7 @@ def rtu(link: OneAnswer) -> ModbusRtu:
 
 
 def ask(master: ModbusMaster, e: dict[str, Any]) -> None:
-    """Send the request that a vector describes; nobody answers."""
+    """Send the request that a vector describes, without an answer."""
     unit, address, until_s = e["unit"], e["address"], now_s()  # one attempt
     with pytest.raises(NoAnswer):
         if e["fc"] == 16:
@@ -124,7 +124,7 @@ def test_modbus_tcp(v: dict[str, Any]) -> None:
     elif "bits_low" in e:
         bits = _tcp(frame).read_bits(unit=e["unit"], address=0, count=16, until_s=until_s, function=e["fc"])
         assert sum(1 << i for i, bit in enumerate(bits[:8]) if bit) == e["bits_low"]
-    elif e["fc"] == 5:  # never sent here (see drivers.transport.modbus), but the far side understands it
+    elif e["fc"] == 5:  # the drivers never send it (see drivers.transport.modbus), but the emulator understands it
         assert frame[6:] == struct.pack(">BBHH", e["unit"], 5, e["address"], 0xFF00 * e["value"])
     else:
         link = OneAnswer()

@@ -1,4 +1,4 @@
-"""The doctor finds missing, taken and forbidden ports, wrong baud rates, and measures what answers."""
+"""The doctor finds missing, busy and forbidden ports and wrong baud rates, and measures devices that answer."""
 
 import os
 import termios
@@ -54,10 +54,10 @@ def test_devices_with_a_serial_wire_are_told_by_their_options(options: dict[str,
 
 
 class Answers:
-    """A device that is there."""
+    """Device that is present."""
 
     def close(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 def test_the_baud_rate_that_answers_is_named(tmp_path: Path) -> None:
@@ -87,10 +87,10 @@ def test_a_device_that_never_answers_keeps_its_own_words(tmp_path: Path) -> None
 
 
 class NoisyAtOtherBauds(PtyPort):
-    """A line on which a wrong baud rate gives noise."""
+    """Port on which a wrong baud rate gives noise."""
 
     def send(self, peer: Any, data: bytes) -> None:
-        """The frame, or what a receiver at another speed makes of it."""
+        """Send the frame, or the noise that a receiver at another baud rate gets."""
         super().send(peer, data if self.speed() == termios.B115200 else bytes(b ^ 0xE6 for b in data[::2]))
 
 
@@ -108,7 +108,7 @@ def test_a_driver_at_the_wrong_baud_rate_is_told_the_one_that_answers() -> None:
 
 @pytest.fixture
 def adapter(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """A USB adapter as the kernel shows it: stable name, tree of sysfs, latency timer."""
+    """Create a USB adapter as the kernel presents it: stable name, sysfs tree, latency timer."""
     device = tmp_path / "ttyUSB7"
     device.touch()
     stable = tmp_path / "usb-acme-if00"

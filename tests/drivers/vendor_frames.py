@@ -1,4 +1,4 @@
-"""Frames of SICK CoLa and UFACTORY xArm, for which there is no driver: they prove the framer on two more protocols."""
+"""Frames of SICK CoLa and UFACTORY xArm, which have no driver, to test the framer with two more protocols."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ LONGEST = 65_536
 
 
 def cola_a(text: str) -> bytes:
-    """`02 text 03` (SICK LMS4xxx telegram listing, p 52)."""
+    """Return a frame `02 text 03` (SICK LMS4xxx telegram listing, p 52)."""
     return b"\x02" + text.encode("ascii") + b"\x03"
 
 
 def decode_cola_a(frame: bytes) -> str:
-    """The text between the marks.
+    """Return the text between the start and end marks.
 
     Raises:
         ValueError: a mark is missing.
@@ -31,12 +31,12 @@ def decode_cola_a(frame: bytes) -> str:
 
 
 def cola_b(payload: bytes) -> bytes:
-    """`02020202 length32 payload xor` (big-endian; SICK LMS4xxx telegram listing, p 55)."""
+    """Return a frame `02020202 length32 payload xor` (big-endian; SICK LMS4xxx telegram listing, p 55)."""
     return COLA_B_START + struct.pack(">I", len(payload)) + payload + bytes([xor_byte(payload)])
 
 
 def cola_b_framer() -> Framer:
-    """CoLa B telegrams out of bytes."""
+    """Return a framer for CoLa B telegrams."""
     return Framer(COLA_B_START, _cola_b_length, lambda f: xor_byte(f[COLA_B_HEAD:-1]) == f[-1])
 
 
@@ -49,7 +49,7 @@ def _cola_b_length(data: bytes) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class XarmFrame:
-    """`tid16 0002 len16 register [state] parameters`; only answers have a state."""
+    """xArm frame `tid16 0002 len16 register [state] parameters`; only answers have a state."""
 
     tid: int
     register: int
@@ -63,15 +63,15 @@ class XarmFrame:
 
 
 def xarm(tid: int, register: int, parameters: bytes = b"") -> bytes:
-    """A request (docs.ufactory.cc, private Modbus TCP)."""
+    """Return a request (docs.ufactory.cc, private Modbus TCP)."""
     return struct.pack(">HHHB", tid, XARM_PROTOCOL, 1 + len(parameters), register) + parameters
 
 
 def decode_xarm(frame: bytes, *, is_answer: bool) -> XarmFrame:
-    """A whole frame.
+    """Decode a complete frame.
 
     Raises:
-        ValueError: another protocol, or the length does not fit.
+        ValueError: the frame has another protocol, or the length does not fit.
     """
     tid, protocol, length, register = struct.unpack_from(">HHHB", frame)
     if protocol != XARM_PROTOCOL or length != len(frame) - 6:

@@ -1,4 +1,4 @@
-"""The example of a kind from a package: installed, its four parts are found, and its latch and reader do what it says."""
+"""Tests of the example package of a kind: its four parts are found when installed, and latch and reader work."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ print(json.dumps({
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment of processes that have the example's package beside panelwright."""
+    """Return the environment of a process in which the example package is installed beside panelwright."""
     target = tmp_path_factory.mktemp("packages")
     source = tmp_path_factory.mktemp("source") / "kind-package"
     subprocess.run(["cp", "-r", str(ROOT / "examples" / "kind-package"), str(source)], check=True)

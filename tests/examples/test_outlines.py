@@ -1,4 +1,4 @@
-"""Line drawings show what a camera would see, and no more."""
+"""Line drawings show what a camera would see, without the parts behind it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's range image again: quadrics by Givens rotations, and six regions as in 1990 beside ours."""
+"""Tests of the paper's range methods: quadrics by Givens rotations, and the segmentation into six regions."""
 
 from __future__ import annotations
 
@@ -80,6 +80,6 @@ def test_the_six_regions_of_figure_10_are_found_and_named_today_and_only_in_part
         )
         for share in SHARES:
             print(f"  share {share:.2f}: 1990 {before[share]}, today {now[share]}")
-    # The more of the codes the scene fills, the more the method of 1990 finds: the paper's claim about the range.
+    # The paper's claim: the method of 1990 finds more if the scene fills more of the range of codes.
     assert before[0.1][0] < before[1.0][0] < PAPER_REGIONS
     assert all(found == (PAPER_REGIONS, PAPER_REGIONS) for share, found in now.items() if share >= 0.25)

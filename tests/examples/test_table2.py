@@ -1,4 +1,4 @@
-"""The paper's Table II beside ours: `pytest -s` prints it."""
+"""Compares the paper's Table II with ours; `pytest -s` prints it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A file that is replaced is never half there."""
+"""A file that is replaced is never incomplete."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera model against OpenCV's, its own derivatives by finite differences, and its inverse."""
+"""Compares the camera model with OpenCV's, its derivatives with finite differences, and tests its inverse."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_inverse_jacobian_agrees_with_finite_differences() -> None:
 def test_a_pixel_beyond_the_fold_of_the_lens_is_not_a_number() -> None:
     folding = CameraIntrinsics(width_px=2000, height_px=2000, fx_px=600.0, fy_px=600.0, cx_px=1000.0, cy_px=1000.0,
                                distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))  # fmt: skip
-    ideal = undistort_pixels([[1100.0, 1000.0], [1990.0, 1000.0]], folding)  # folds at r_d = 0.70, 422 px
+    ideal = undistort_pixels([[1100.0, 1000.0], [1990.0, 1000.0]], folding)  # no inverse beyond r_d = 0.70, 422 px
     assert np.isfinite(ideal[0]).all()
     assert np.isnan(ideal[1]).all()
 
@@ -103,7 +103,7 @@ def test_a_discs_image_has_its_middle_where_adding_up_its_points_says() -> None:
     disc = radius_m * np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])[x.ravel() ** 2 + y.ravel() ** 2 <= 1.0]
     for middle, offset_px in zip(middles, disc_offset_px(middles, radius_m, camera_from_plate, IDEAL), strict=True):
         seen = camera_from_plate.apply(middle + disc)
-        area = seen[:, 2] ** -3.0  # of a piece of a plane, up to what is the same for all of it
+        area = seen[:, 2] ** -3.0  # image area of a surface element of a plane, up to a constant factor
         mean = (area @ project(seen, IDEAL)) / area.sum()
         assert np.allclose(offset_px, mean - project(camera_from_plate.apply(middle)[None], IDEAL)[0], atol=0.02 * 0.5)
         assert np.linalg.norm(offset_px) > 0.2

@@ -1,4 +1,4 @@
-"""Which core a thread goes to, and that only it goes there."""
+"""Tests which core a thread is pinned to, and that only this thread is pinned."""
 
 from __future__ import annotations
 

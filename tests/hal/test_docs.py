@@ -1,4 +1,4 @@
-"""The file references in docs/ name every key that the models know."""
+"""The file references in docs/ name every key of the models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The face of a package: its names are loaded when they are first used."""
+"""The public names of a package are loaded when they are first used."""
 
 from __future__ import annotations
 

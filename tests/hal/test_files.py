@@ -1,4 +1,4 @@
-"""Cell, panel and calibration files: what is right is read, what is wrong is named by file, key and remedy."""
+"""Valid cell, panel and calibration files are read; errors in wrong ones name file, key and remedy."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_a_cable_that_cannot_hang_is_refused(cell_path: Path, path_m: str, mode:
 
 @pytest.mark.parametrize("lit", ["start", "pressure", "lamp_2"])
 def test_a_button_lights_lamps_only(cell_path: Path, lit: str) -> None:
-    """Any other object would fail in the simulator, where nobody thinks of the panel file."""
+    """Otherwise the object would fail only in the simulator, far from the panel file."""
     panel = cell_path.parents[1] / "panels/tiny.toml"
     button = f'kind = "button"\nname = "start"\nposition_m = [0.1, 0.0]\nradius_m = 0.01\nlights_lamp = "{lit}"\n'
     panel.write_text(f"{PANEL}[[objects]]\n{button}")

@@ -1,4 +1,4 @@
-"""The frames of a cell file: every mounted device where its record says, in whatever order they hang on each other."""
+"""The frames of a cell file place every mounted device by its record, in whatever order the mounts are listed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOUNTED = {"gripper", "wrist_camera", "range_scanner", "proximity_left", "proxim
 
 
 def hung(cell: Cell, device: str, parent: str) -> Cell:
-    """The cell with a device mounted on another frame."""
+    """Return the cell with a device mounted on another frame."""
     section = cell.file.devices[device]
     assert section.mount is not None
     moved = section.model_copy(update={"mount": section.mount.model_copy(update={"parent": parent})})

@@ -1,4 +1,4 @@
-"""Full collections skip what was frozen, and still find later cycles."""
+"""Full garbage collections skip frozen objects and still find later cycles."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from hal.gc_freeze import freeze_loaded
 
 
 class Link:
-    """Two of these make a cycle."""
+    """Object of which two make a reference cycle."""
 
     other: Link | None = None
 
 
 @pytest.fixture(autouse=True)
 def thawed() -> object:
-    """Leave the collector of the test process as it was."""
+    """Restore the collector of the test process afterwards."""
     yield
     gc.unfreeze()
 

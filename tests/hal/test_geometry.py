@@ -1,4 +1,4 @@
-"""Covariance transport against finite differences and sampling."""
+"""Compares the propagation of covariances with finite differences and sampling."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hal.geometry import (
 
 numbers = st.floats(-2.0, 2.0)
 vectors = st.tuples(numbers, numbers, numbers).map(np.array)
-turns = vectors.map(lambda v: 0.85 * v)  # shorter than half a turn, beyond which a rotation vector is not unique
+turns = vectors.map(lambda v: 0.85 * v)  # less than half a turn, beyond which rotation vectors are not unique
 poses = st.builds(lambda t, r: RigidTransform.from_components(t, Rotation.from_rotvec(r)), vectors, vectors)
 
 

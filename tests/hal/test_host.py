@@ -1,4 +1,4 @@
-"""Objects behind process borders behave like themselves."""
+"""Objects in other processes behave like local ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hal.registry import Context
 
 
 class Calculator:
-    """An object worth a process of its own."""
+    """Object that is served by another process."""
 
     name = "calculator"
 
@@ -46,7 +46,7 @@ class Calculator:
         return threading.Lock()
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing, because there is nothing to release."""
 
 
 def make() -> dict[str, object]:
@@ -70,7 +70,7 @@ def test_arrays_of_any_size_come_back_whole(host: HostProcess, size: int) -> Non
     answer = host.proxy("calculator").double(image)
     assert (answer.host_time_s, answer.sequence) == (1.5, 3)
     np.testing.assert_array_equal(answer.value, image * 2)
-    answer.value[0] = 7  # a received array is the receiver's own
+    answer.value[0] = 7  # a received array belongs to the receiver
 
 
 def test_typed_errors_come_back_as_themselves(host: HostProcess) -> None:
@@ -108,13 +108,13 @@ def test_an_answer_that_cannot_travel_is_a_defect_and_the_host_lives(host: HostP
 
 def test_an_interrupted_call_does_not_leave_its_answer_to_the_next(host: HostProcess) -> None:
     class CtrlC(WallClock):
-        """Interrupts once the request has left: when the time for its answer is asked for."""
+        """Clock that raises KeyboardInterrupt after the request was sent, when the wait for the answer begins."""
 
         asked = 0
 
         def now_s(self) -> float:
             self.asked += 1
-            if self.asked > 2:  # before: the wait for the proxy, and the time that travels with the request
+            if self.asked > 2:  # the first two calls are for the proxy's lock and for the deadline in the request
                 raise KeyboardInterrupt
             return 0.0
 
@@ -128,7 +128,7 @@ def test_a_call_behind_a_slow_one_ends_at_its_own_deadline(host: HostProcess) ->
     proxy = host.proxy("calculator")
 
     def hang() -> None:
-        with suppress(DeviceTimeout, DeviceUnavailable):  # whichever comes first: its deadline, or the host's end
+        with suppress(DeviceTimeout, DeviceUnavailable):  # either the deadline or the end of the host comes first
             proxy.hang(deadline=Deadline.after(WallClock(), 5.0))
 
     slow = threading.Thread(target=hang, daemon=True)
@@ -137,7 +137,7 @@ def test_a_call_behind_a_slow_one_ends_at_its_own_deadline(host: HostProcess) ->
         slow.join(0.001)
     with pytest.raises(DeviceTimeout, match="remaining"):
         proxy.remaining(deadline=Deadline.after(WallClock(), 0.01))
-    assert slow.is_alive()  # it did not have to wait for the slow one's end
+    assert slow.is_alive()  # the call did not wait for the end of the slow one
 
 
 def test_constants_are_known_and_unknown_names_are_not(host: HostProcess) -> None:
@@ -193,7 +193,7 @@ def test_a_closing_server_ends_the_threads_that_wait_for_its_clients(
 
 def test_a_server_closes_even_if_nobody_accepts_any_more(tmp_path: Path) -> None:
     server = HostServer(make(), str(tmp_path / "socket"), b"key", WallClock())
-    server._is_closed.set()  # as `close` does while the thread is between two connections: it ends without another look
+    server._is_closed.set()  # as if `close` is called while the thread is between two connections
     with socket.socket(socket.AF_UNIX) as bell:
         bell.connect(server.address)
     server._thread.join(30.0)

@@ -1,4 +1,4 @@
-"""Compiled kernels are found again when their sources are the same, and only then."""
+"""Compiled kernels are reused if and only if their sources are the same."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ print(answer, "compiled" if mine else "kept", before, len(kernel_cache.missing(k
 
 
 class Project:
-    """Two modules that use kernels, run in processes of their own with a folder of compiled kernels."""
+    """Two modules with kernels, which are run in separate processes with their own folder of compiled kernels."""
 
     def __init__(self, folder: Path, kernels: Path) -> None:
         self.folder, self.kernels = folder, kernels
@@ -52,7 +52,7 @@ class Project:
         (self.folder / "caller.py").write_text(head + CALLER)
 
     def run(self) -> list[str]:
-        """Call the kernel: its answer, whether it was compiled, and how many were missing before and after."""
+        """Call the kernel; return its result, whether it was compiled, and the kernels missing before and after."""
         # A command that another test of this process ran may have asked for a path without the script's folder.
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(self.kernels), "PYTHONSAFEPATH": ""}
         done = subprocess.run(

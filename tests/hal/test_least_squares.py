@@ -1,4 +1,4 @@
-"""The damped solver against scipy's, and what it refuses."""
+"""Compares the damped solver with scipy's, and tests what it refuses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SEEN = 2.0 * np.exp(-0.7 * TIMES_S) + 0.3 + 0.01 * np.random.default_rng(1).norm
 
 
 def linearised(x: Array) -> tuple[Array, Array]:
-    """An exponential decay with an offset, three parameters of very different sensitivity."""
+    """Exponential decay with an offset: three parameters of very different sensitivity."""
     decay = np.exp(-x[1] * TIMES_S)
     residual = (x[0] * decay + x[2] - SEEN) / 0.01
     return residual, np.column_stack([decay, -x[0] * TIMES_S * decay, np.ones(20)]) / 0.01

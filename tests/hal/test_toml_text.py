@@ -1,4 +1,4 @@
-"""Values written as TOML come back as they were, whatever they hold, and comments of an edited text stay."""
+"""Values written as TOML are read back unchanged, and comments of an edited text are preserved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readings, clocks, errors, frames and the registry."""
+"""Tests of readings, clocks, errors, frames and the registry."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_paced_clock_tells_what_it_showed_at_a_moment_of_the_wall() -> None:
         ticks.append((time.monotonic(), clock.now_s()))
     for wall_s, shown_s in ticks:
         assert clock.at_s(wall_s) == shown_s
-    assert clock.at_s(ticks[0][0] - 10.0) < ticks[0][1] - 9.0  # before its memory it went with the wall
+    assert clock.at_s(ticks[0][0] - 10.0) < ticks[0][1] - 9.0  # before its stored ticks it follows the wall clock
 
 
 def test_a_paced_clock_does_not_count_the_time_that_a_tick_took_too_long() -> None:

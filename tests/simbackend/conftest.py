@@ -1,4 +1,4 @@
-"""One world for the whole package: starting one takes a second."""
+"""One world for all tests of the package, because starting one takes a second."""
 
 from collections.abc import Iterator
 
@@ -9,6 +9,6 @@ from tests.simbackend.rig import SimCell, sim_cell
 
 @pytest.fixture(scope="package")
 def bench() -> Iterator[SimCell]:
-    """The bench cell; tests leave its arm at rest and its panel as they like."""
+    """Yield the bench cell; every test must leave the arm at rest, but may leave the panel in any state."""
     with sim_cell() as cell:
         yield cell

@@ -1,4 +1,4 @@
-"""One simulated cell for many tests: the world starts once, every test connects its devices anew."""
+"""Simulated cell for many tests: the world is started once, and every test connects its own devices."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ BENCH = ROOT / "cells" / "bench.toml"
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class SimCell:
-    """A cell, its clock and the world behind it."""
+    """Cell with its clock and its simulated world."""
 
     cell: Cell
     clock: SimClock = field(default_factory=SimClock)
     shared: Shared = field(default_factory=Shared)
 
     def connect(self, name: str, **options: Any) -> Any:
-        """A fresh device over the common world."""
+        """Return a new device of the common world."""
         section = self.cell.file.devices[name]
         context = Context(name=name, clock=self.clock, cell=self.cell, shared=self.shared)
         return connect(context, section.driver, {**section.options, **options})
 
     def deadline(self, duration_s: float = 1.0) -> Deadline:
-        """A deadline on simulated time."""
+        """Return a deadline in simulated time."""
         return Deadline.after(self.clock, duration_s)
 
 
 @contextmanager
 def sim_cell(path: Path = BENCH, *, seed: int = 11) -> Iterator[SimCell]:
-    """A running cell."""
+    """Yield a running cell."""
     cell = SimCell(cell=load_cell(path, seed=seed))
     try:
         yield cell
@@ -48,9 +48,9 @@ def sim_cell(path: Path = BENCH, *, seed: int = 11) -> Iterator[SimCell]:
 
 
 def injector(device: Device) -> Any:
-    """What `Rig.inject` wants, over the simulator's own fault injection."""
+    """Return a function for `Rig.inject` that uses the simulator's fault injection."""
 
     def inject(fault: Fault | None) -> None:
-        device.inject_fault(fault)  # every simulated device has it
+        device.inject_fault(fault)  # every simulated device has this method
 
     return inject

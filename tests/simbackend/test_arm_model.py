@@ -1,4 +1,4 @@
-"""The arms: kinematics against EAIK and the engine, reach, and text that the engine's parser can read."""
+"""Tests of the arm models: kinematics against EAIK and the engine, reach, and URDF text that the engine can parse."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_t3_reaches_1_04_m_from_shoulder_to_flange() -> None:
 
 @pytest.mark.parametrize("cell_name", ["bench", "ur10e"])
 def test_every_object_is_reached_squarely_and_off_the_wrist_singularity(cell_name: str) -> None:
-    """At the plate and 0.4 m before it, panel within 60 mm and 8 degrees: a solution in limits, sin q5 > 0.3."""
+    """At the plate and 0.4 m in front, with the panel off by 60 mm and 8 degrees, a solution has sin q5 > 0.3."""
     from simbackend.draws import Draws
 
     cell = load_cell(ROOT / "cells" / f"{cell_name}.toml")

@@ -1,4 +1,4 @@
-"""The camera: does a pixel mean what the lens says, and do the corruptions do what they are named for?"""
+"""Tests of the camera: pixels agree with the lens model, and each corruption has its effect."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def info(*lit: Emitter) -> PictureInfo:
 
 
 def project(points_m: Array, lens: CameraIntrinsics) -> Array:
-    """OpenCV as the independent lens."""
+    """Return pixels by OpenCV, as an independent lens model."""
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
     pixels, _ = cv2.projectPoints(
         np.array(points_m, order="C"), np.zeros(3), np.zeros(3), matrix, np.array(lens.distortion)
@@ -82,7 +82,7 @@ def test_a_spot_of_the_ideal_drawing_lands_where_the_lens_bends_it() -> None:
 
 
 def test_border_lights_appear_where_truth_lens_and_mount_put_them(bench: SimCell) -> None:
-    """The whole chain against OpenCV: panel pose, kinematics, mount, lens, drawing, sensor."""
+    """Compares the whole chain with OpenCV: panel pose, kinematics, mount, lens, drawing, sensor."""
     lights, camera, arm = bench.connect("panel_lights"), bench.connect("wrist_camera"), bench.connect("arm")
 
     def picture(on: bool) -> Array:
@@ -148,7 +148,7 @@ def test_a_colour_camera_gives_three_channels(bench: SimCell) -> None:
     camera = bench.connect("wrist_camera", colour=True)
     image = camera.read_image(deadline=bench.deadline()).value.pixels
     assert image.shape == (480, 640, 3)
-    assert np.abs(image[:, :, 0].astype(int) - image[:, :, 2]).max() > 60  # something red or blue is in view
+    assert np.abs(image[:, :, 0].astype(int) - image[:, :, 2]).max() > 60  # something red or blue is visible
 
 
 def test_a_rescaled_lens_sees_the_same_field() -> None:

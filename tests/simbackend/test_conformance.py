@@ -1,4 +1,4 @@
-"""Every simulated device keeps the promises of its kind, on the bench cell."""
+"""Every simulated device of the bench cell fulfils the contract of its kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arm at the panel: weight, touch, proximity, a pressed button and its lamp, all through the devices."""
+"""Tests of the arm at the panel: weight, touch, proximity, a pressed button and its lamp, read from the devices."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TICK_S = 0.002
 
 @dataclass(eq=False)
 class Finger:
-    """Moves closed fingers by the truth: these tests are about sensors, not about finding the panel."""
+    """Moves closed fingers by the true panel pose, because these tests are about sensors."""
 
     cell: SimCell
 
@@ -48,7 +48,7 @@ class Finger:
         return np.asarray(min(fits, key=lambda q: np.abs(q - here).max()))
 
     def go(self, point_m: Array, seconds: float) -> None:
-        """Straight in joint space; over a few centimetres that is straight enough."""
+        """Move on a straight line in joint space, which is nearly straight in space over a few centimetres."""
         start, goal = self.joints(), self.solve(point_m)
         steps = round(seconds / TICK_S)
         for i in range(1, steps + 1):
@@ -83,14 +83,14 @@ def test_at_rest_the_sensor_carries_the_weight_of_the_tool_and_its_bias(finger: 
     base_from_sensor = base_from_flange_ * true_mount(cell.cell, draws, "wrist_ft")
     weight_n = base_from_sensor.rotation.inv().apply([0.0, 0.0, -9.81 * load.mass_kg])
     np.testing.assert_allclose(wrench.force_n - load.bias[:3], weight_n, atol=0.03)
-    # The recorded centre of mass explains the torque to a few millimetres of lever.
+    # The recorded centre of mass explains the torque to a lever arm of a few millimetres.
     torque_nm = np.cross(load.centre_of_mass_m, weight_n)
     np.testing.assert_allclose(wrench.torque_nm - load.bias[3:], torque_nm, atol=0.05)
 
 
 def test_proximity_is_the_distance_to_the_plate(finger: Finger) -> None:
     cell = finger.cell
-    finger.go(np.array([0.02, 0.055, 0.060]), 2.0)  # before bare plate
+    finger.go(np.array([0.02, 0.055, 0.060]), 2.0)  # in front of bare plate
     near = cell.connect("proximity_left", sigma_m=0.0, resolution_m=1e-6)
     measured_m = near.read_distance_m(deadline=cell.deadline()).value
     pose = base_from_flange(finger.arm.capabilities().links, finger.joints())
@@ -111,7 +111,7 @@ def test_a_pressed_button_is_felt_counted_and_lights_its_lamp(finger: Finger) ->
     cell.clock.sleep(0.05)
     assert any(touch.read_contacts(deadline=cell.deadline()).value)
     push_n = free - force.read_wrench(deadline=cell.deadline()).value.force_n[2]
-    assert 4.0 < push_n < 14.0  # the spring of the file, its tolerance, and what the pads add
+    assert 4.0 < push_n < 14.0  # force of the spring in the file, with tolerance and the pads' contribution
     assert finger.shown("start").state == "pressed"
     finger.go(place(finger, "start", button.height_m + 0.03), 1.0)
     after = finger.shown("start")

@@ -1,4 +1,4 @@
-"""The same seed and the same motions give the same bits, in another process and beside a curious reader."""
+"""The same seed and motions give identical bits, in another process and with an additional reader."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.simbackend.rig import BENCH, SimCell, sim_cell
 
 
 def script(cell: SimCell, *, curious: bool = False) -> str:
-    """A small closed loop over every device; returns a hash of all that was read."""
+    """Run a short closed loop over every device; return a hash of all readings."""
     devices = {name: cell.connect(name) for name in cell.cell.file.devices}
     arm, force, lights = devices["arm"], devices["wrist_ft"], devices["panel_lights"]
     digest = hashlib.sha256()
@@ -18,7 +18,7 @@ def script(cell: SimCell, *, curious: bool = False) -> str:
     q = arm.read_state(deadline=cell.deadline()).value.position_rad
     for i in range(60):
         wrench = force.read_wrench(deadline=cell.deadline()).value
-        # The measured force steers, so that one different bit of noise would spread to everything.
+        # The measured force controls the motion, so that one different bit of noise would change everything.
         q = q + np.array([2e-4, 1e-4, 0, 0, 1e-4, 1e-6 * wrench.force_n[0]])
         arm.command_position(q, deadline=cell.deadline())
         if i == 30:

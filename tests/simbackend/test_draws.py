@@ -1,4 +1,4 @@
-"""What the seed decides: repeatable, independent by name, within what the files promise."""
+"""Random values of a seed are repeatable, independent by name, and within the limits of the files."""
 
 from __future__ import annotations
 

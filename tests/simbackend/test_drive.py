@@ -1,4 +1,4 @@
-"""Between set-point and motor: following, braking, the watchdog, the gripper's screw."""
+"""Tests of the drives between set-point and motor: following, braking, the watchdog, the gripper's screw."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REST = np.zeros(6)
 
 
 def moving_drive(speed: float = 0.5) -> ArmDrive:
-    """A drive in the middle of a motion of joint 1."""
+    """Return a drive in the middle of a motion of joint 1."""
     drive = ArmDrive(t3().capabilities, REST, DT_S)
     drive.enable(REST.tolist())
     for i in range(1, 50):
@@ -49,12 +49,12 @@ def test_stop_brakes_at_the_acceleration_limit_and_stays() -> None:
 
 
 def bunched(speed: float, ticks: int, *, every: int) -> np.ndarray:
-    """Set-point of joint 1 for each tick, all of `every` ticks arriving at once: what a wire does to a steady stream."""
+    """Return joint 1's set-points for each tick; those of `every` ticks arrive at once, as over a link with delays."""
     return speed * DT_S * (np.arange(ticks) // every + 1) * every
 
 
 def followed(goals: np.ndarray, lookahead_s: float) -> np.ndarray:
-    """What the drive makes of the goals of joint 1."""
+    """Return the drive's output for goals of joint 1."""
     drive = ArmDrive(t3().capabilities, REST, DT_S, lookahead_s=lookahead_s)
     drive.enable(REST.tolist())
     out = []
@@ -126,7 +126,7 @@ def test_the_gripper_stops_at_the_mean_pad_force_and_locks() -> None:
     for _ in range(50):
         gripper.tick((0.0, 0.0))
     assert gripper.is_moving
-    gripper.tick((39.0, 0.0))  # one finger alone pushes: the screw feels half
+    gripper.tick((39.0, 0.0))  # if one finger alone pushes, half the force acts on the screw
     assert gripper.is_moving
     gripper.tick((25.0, 16.0))
     locked_m = gripper.width_m

@@ -1,4 +1,4 @@
-"""The five faults, by call and by cell file."""
+"""Tests of the five faults, begun by a call or by the cell file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def read(bench: SimCell, name: str, device: Any) -> Stamped[Any]:
 
 
 def content(value: Any) -> Any:
-    """Something comparable out of any device's value."""
+    """Return something comparable from any device's value."""
     for key in ("pixels", "depth_m", "force_n", "position_rad"):
         if hasattr(value, key):
             return np.asarray(getattr(value, key)).tobytes()
@@ -108,7 +108,7 @@ def test_a_fault_of_the_cell_file_begins_when_it_says(bench: SimCell) -> None:
     while bench.clock.now_s() < begin_s - 0.003:
         assert math.isfinite(device.read_wrench(deadline=bench.deadline()).value.force_n[0])
         bench.clock.sleep(0.002)
-    bench.clock.sleep(0.01)  # one long sleep across the moment must not miss it
+    bench.clock.sleep(0.01)  # one long sleep that includes the begin of the fault must not miss it
     with pytest.raises(DeviceTimeout):
         device.read_wrench(deadline=bench.deadline())
 
@@ -164,7 +164,7 @@ def test_a_world_whose_cell_dies_while_it_works_ends_without_a_word(capfd: pytes
         world = cell.shared.peek("world")
         assert world is not None
         process = world._link.process
-        process.send_signal(signal.SIGSTOP)  # it will find the request and the closed pipe at once
+        process.send_signal(signal.SIGSTOP)  # later it finds the request and the closed pipe at the same time
         request = np.zeros(REQUEST)
         request[:2] = Op.STEP, 1
         os.write(world._link._stream, request.tobytes())

@@ -1,4 +1,4 @@
-"""The shipped panel, cells and records: whole, buildable and roomy enough for the fingers."""
+"""The shipped panel, cells and records are complete, can be simulated, and leave enough space for the fingers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_cell_file_differs_from_the_bench_in_arm_and_workspace_only(name: str)
 
 
 def test_the_nominal_tool_load_balances_the_model() -> None:
-    """The record is the weighing of the nominal tool: body, fingers and the sensor's lower part."""
+    """The record equals the load of the nominal tool: body, fingers and the sensor's lower part."""
     from simbackend import tool_model
 
     record = load_cell(ROOT / "cells" / "bench.toml").calibrations["wrist_ft"].load
@@ -65,7 +65,7 @@ def test_the_ur10e_cell_comes_up_and_sees_its_panel() -> None:
         cell.clock.sleep(0.5)
         assert np.abs(arm.read_state(deadline=cell.deadline()).value.position_rad - start).max() < 1e-5
         image = cell.connect("wrist_camera").read_image(deadline=cell.deadline()).value.pixels
-        assert np.mean(image > 110) > 0.15  # the light plate fills a good part of the view
+        assert np.mean(image > 110) > 0.15  # the bright plate fills much of the image
 
 
 # ruff: noqa: E501

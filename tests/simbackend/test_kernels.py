@@ -1,4 +1,4 @@
-"""The compiled steps against plain numpy."""
+"""Compares the compiled steps with plain numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Springs, friction, detents and latches against what the panel file promises, pushed by a known force."""
+"""Compares springs, friction, detents and latches with the panel file, under a known force."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DT_S = 0.002
 
 
 class Engine:
-    """PyBullet with its client's id filled in."""
+    """PyBullet with its client's id as argument of every call."""
 
     def __init__(self) -> None:
         self.client = pybullet.connect(pybullet.DIRECT)
@@ -48,10 +48,10 @@ def load(engine: Engine, folder: Path, panel_object: Any, place: float = 0.0) ->
 
 
 def push(engine: Engine, body: int, effort: float, drive: Callable[[], None], seconds: float = 1.0) -> float:
-    """Where the joint is after a constant push (N or N m along the joint)."""
+    """Return the joint's position after a constant force or torque (N or N m along the joint)."""
     for _ in range(round(seconds / DT_S)):
         drive()
-        # The spring's own torque command replaces, not adds, so the push comes from outside as the finger's does.
+        # A joint torque would replace that of the spring, so the force is external, as a finger's is.
         _external(engine, body, effort)
         engine.stepSimulation()
     return float(engine.getJointState(body, JOINT)[0])
@@ -64,7 +64,7 @@ def _external(engine: Engine, body: int, effort: float) -> None:
         position = engine.getLinkState(body, JOINT, computeForwardKinematics=1)[0]
         engine.applyExternalForce(body, JOINT, along, position, engine.WORLD_FRAME)
     else:
-        # A couple: the engine's external torque on a fixed-base link is unreliable, two forces are not.
+        # A couple of two forces, because the engine's external torque on a fixed-base link is unreliable.
         axis = info[13]
         arm = (1.0, 0.0, 0.0) if abs(axis[0]) < 0.5 else (0.0, 1.0, 0.0)
         cross = [

@@ -1,4 +1,4 @@
-"""What the judge is told, against mechanisms in known places."""
+"""Tests of the truth that the judge receives, with mechanisms at known positions."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ STATES = (State(name="open", angle_rad=0.0), State(name="closed", angle_rad=1.57
 
 @dataclass
 class At:
-    """A mechanism that rests where it was put."""
+    """Mechanism that rests where it was put."""
 
     where: float
     body: int = 0
 
     def lock(self) -> None:
-        """Nothing to hold."""
+        """Do nothing, because there is nothing to hold."""
 
     def drive(self) -> None:
-        """Nothing to drive."""
+        """Do nothing, because there is nothing to drive."""
 
     def place(self) -> float:
         return self.where

@@ -1,4 +1,4 @@
-"""The range scanner: exact depth underneath, and corruptions that do what they are named for."""
+"""Tests of the range scanner: the depth is exact, and each corruption has its effect."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_clean_scan_lies_on_the_true_plate(bench: SimCell, size: int) -> None:
     inside = (np.abs(on_panel[:, 0]) < 0.30) & (np.abs(on_panel[:, 1]) < 0.22)
     heights = on_panel[inside, 2]
     assert len(heights) > 0.2 * size * size
-    # Most of it is bare plate, to a hundredth of a millimetre; the rest stands out of it, and nothing lies under it.
+    # Most points are on the bare plate, to 0.01 mm; the others are in front of it, and none is behind it.
     assert np.mean(np.abs(heights) < 1e-5) > 0.6
     assert heights.min() > -1e-5
     assert 0.01 < heights.max() < 0.04
@@ -88,7 +88,7 @@ def test_a_line_scanner_keeps_its_scans_while_it_records_and_each_is_of_its_own_
     scans = scanner.end_recording(deadline=bench.deadline())
     assert 6 <= len(scans) <= 8
     np.testing.assert_allclose(np.diff([scan.host_time_s for scan in scans]), 0.04, atol=0.0021)
-    for scan in scans:  # the arm rests, so that every line is the first one
+    for scan in scans:  # the arm rests, so all scans are equal
         np.testing.assert_allclose(scan.value.depth_m, line, atol=2e-5)
     bench.clock.sleep(0.2)
     assert scanner.end_recording(deadline=bench.deadline()) == ()

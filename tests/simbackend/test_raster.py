@@ -1,4 +1,4 @@
-"""The rasteriser against ray casting: depth, place, colour, clipping, hidden surfaces."""
+"""Compares the rasteriser with ray casting: depth, position, colour, clipping, hidden surfaces."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NO_TEXTURE = (np.zeros(1, np.uint8), np.array([[0, 2, 2, 0]], np.int64))
 def draw(
     points: Array, colours: Array, uv: Array | None = None, textures: tuple[Array, Array] | None = None
 ) -> tuple[Array, Array]:
-    """Image (H, W) and depth (H, W) of triangles in camera axes."""
+    """Return image (H, W) and depth (H, W) of triangles in camera axes."""
     count = len(points)
     attributes = np.ones((count, 3, 3))
     attributes[:, :, 1:] = 0.0 if uv is None else uv
@@ -33,13 +33,13 @@ def draw(
 
 
 def rays() -> Array:
-    """(H, W, 3) directions through the pixels' centres, z = 1."""
+    """Return (H, W, 3) directions through the pixel centres, z = 1."""
     v, u = np.mgrid[0:H, 0:W]
     return np.stack([(u - CAMERA[2]) / CAMERA[0], (v - CAMERA[3]) / CAMERA[1], np.ones((H, W))], axis=-1)
 
 
 def cast(triangle: Array) -> tuple[Array, Array]:
-    """(H, W) depth by Moeller and Trumbore, inf for a miss or a back face; how far inside (above 0) a ray passes."""
+    """Return (H, W) depth by Moeller and Trumbore, inf for a miss or a back face, and a margin that is > 0 inside."""
     d = rays()
     a, e1, e2 = triangle[0], triangle[1] - triangle[0], triangle[2] - triangle[0]
     p = np.cross(d, e2)
@@ -66,7 +66,7 @@ def test_a_triangle_is_where_rays_meet_it(corners: tuple[tuple[float, float, flo
     expected, inside = cast(triangle)
     both = np.isfinite(depth) & np.isfinite(expected)
     np.testing.assert_allclose(depth[both], expected[both], rtol=2e-5)
-    # A pixel may differ only where its centre lies on an edge.
+    # Pixels may differ only if their centre is on an edge.
     differs = np.isfinite(depth) != np.isfinite(expected)
     assert np.all(np.abs(inside[differs]) < 1e-6)
 
@@ -90,7 +90,7 @@ def test_a_ball_has_the_depth_of_a_ball() -> None:
     centre = np.array([0.02, -0.01, 0.4])
     b, n = d @ centre, (d * d).sum(axis=-1)
     under = b * b - n * (centre @ centre - 0.03**2)
-    seen = under > 0.3 * under.max()  # off the silhouette, where the corners of the mesh show
+    seen = under > 0.3 * under.max()  # without the silhouette, where the corners of the mesh are visible
     expected = (b - np.sqrt(np.where(seen, under, 0.0))) / n
     assert np.count_nonzero(seen) > 20
     np.testing.assert_allclose(depth[seen], expected[seen], atol=4e-4)
@@ -99,7 +99,7 @@ def test_a_ball_has_the_depth_of_a_ball() -> None:
 def test_a_texture_stands_upright_and_its_corners_are_its_corners() -> None:
     picture = np.array([[10, 20], [30, 40]], np.uint8).repeat(16, 0).repeat(16, 1)  # 10 upper left, 40 lower right
     mesh = meshes.flat((0.4, 0.4), is_round=False)
-    points = mesh.points_m @ np.diag([1.0, -1.0, -1.0]) + [0, 0, 0.6]  # faces the camera, its top up
+    points = mesh.points_m @ np.diag([1.0, -1.0, -1.0]) + [0, 0, 0.6]  # upright, faces the camera
     table = np.array([[0, 32, 32, 0]], np.int64)
     image, _ = draw(points, np.ones(2), mesh.uv, (picture.ravel(), table))
     quarters = [image[15, 22], image[15, 42], image[33, 22], image[33, 42]]
@@ -107,7 +107,7 @@ def test_a_texture_stands_upright_and_its_corners_are_its_corners() -> None:
 
 
 def test_a_distant_texture_is_drawn_from_its_smaller_copy() -> None:
-    """Stripes of one texel, seen 8 texels to a pixel, are grey: without the copies they would flicker."""
+    """Stripes of one texel at 8 texels per pixel are gray; without the smaller copies they would flicker."""
     stripes = np.zeros((256, 256), np.uint8)
     stripes[:, ::2] = 200
     levels = [stripes, *(np.full((size, size), 100, np.uint8) for size in (128, 64, 32))]
@@ -121,7 +121,7 @@ def test_a_distant_texture_is_drawn_from_its_smaller_copy() -> None:
 
 @pytest.mark.parametrize("mesh", [meshes.box(np.array([0.1, 0.2, 0.3])), meshes.cylinder(0.1, 0.3), meshes.sphere(0.1)])
 def test_closed_meshes_turn_their_faces_outwards(mesh: Mesh) -> None:
-    """The signed volume is positive and every normal points away from the middle."""
+    """The signed volume is positive and every normal points away from the centre."""
     a, b, c = mesh.points_m.transpose(1, 0, 2)
     assert np.einsum("ti,ti->t", a, np.cross(b, c)).sum() / 6.0 > 0.0
     assert np.all(np.einsum("tci,tci->tc", mesh.points_m, mesh.normals) > 0.0)

@@ -1,4 +1,4 @@
-"""What is printed: a tick where the scale says, a digit whose segments can be told, marks on the plate."""
+"""Tests of the printed textures: ticks at the right angle, digits with separate segments, marks on the plate."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def grey(pixels: NDArray[np.uint8]) -> Array:
 
 
 def at_angle(face: Array, angle_rad: float, radius_ratio: float) -> float:
-    """Grey level at an angle clockwise from straight up."""
+    """Return the gray level at an angle clockwise from straight up."""
     half = len(face) / 2
     x, y = half * (1 + radius_ratio * np.sin(angle_rad)), half * (1 - radius_ratio * np.cos(angle_rad))
     return float(face[round(y - 0.5), round(x - 0.5)])

@@ -1,4 +1,4 @@
-"""Many readers beside one that lets time pass; and a world that keeps the wall's pace."""
+"""Tests of many readers beside one that lets time pass, and of a world that keeps pace with the wall clock."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def test_in_mixed_mode_stamps_are_the_clocks_and_sleep_takes_its_time() -> None:
         sample = arm.read_state(deadline=Deadline.after(clock, 1.0))
         assert first_s < sample.host_time_s <= clock.now_s()
         assert sample.device_time_s is not None
-        # The world has come as far as the sleeps asked, and on a slow machine as far as the wall, but never farther.
+        # The world is at the time requested by the sleeps or, on a slow machine, up to the wall time, but never beyond.
         assert 0.1 - 1e-9 <= sample.device_time_s <= time.monotonic() - began_s + 0.012
     finally:
         shared.close()
 
 
 def test_a_world_at_the_walls_pace_catches_up_and_forgets_a_pause() -> None:
-    """The wall is a number here: a sleep that took 60 ms lets 60 ms pass in the world, a pause of an hour 200 ms."""
+    """With a fake wall clock, a sleep that took 60 ms advances the world by 60 ms, and a pause of an hour by 200 ms."""
 
     class Wall:
         def __init__(self) -> None:
@@ -106,7 +106,7 @@ def test_a_world_at_the_walls_pace_catches_up_and_forgets_a_pause() -> None:
 
 
 def test_nobody_waits_for_the_world_to_give_an_order(bench: SimCell) -> None:
-    """An emulated wire that hung for the time of a picture would look like a dead device to its driver."""
+    """If an emulated link stopped while an image is rendered, its driver would take the device for dead."""
     arm = bench.connect("arm")
     arm.enable(deadline=bench.deadline())
     bench.clock.sleep(0.002)

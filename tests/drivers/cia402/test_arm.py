@@ -1,4 +1,4 @@
-"""CiA-402 arm over slcan: conformance, no jump, watchdog, emergencies, restarts, faults; python-can opposite."""
+"""Tests of the CiA-402 arm over slcan: conformance, watchdog, emergencies, restarts, faults, python-can as client."""
 
 import struct
 import threading
@@ -27,7 +27,7 @@ from hal.registry import Context, connect
 from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
 
 DRIVER = "can:cia402"
-CALM = {"heartbeat_s": 1.0}  # a busy test machine is no dead host
+CALM = {"heartbeat_s": 1.0}  # long, so that a busy test machine is not taken for a dead host
 
 
 class TestCia402(ArmContract):
@@ -94,7 +94,7 @@ def test_no_fault_of_the_bus_gives_wrong_joints(fault: str) -> None:
     arm = ScriptedArm()
     options = {
         "fault": fault,
-        "every": 500 if fault == "disconnect" else 50,  # the set-up alone has some 50 frames
+        "every": 500 if fault == "disconnect" else 50,  # the set-up alone takes about 50 frames
         "seed": 8,
         "delay_s": 0.05,
         "silent_s": 0.05,
@@ -106,7 +106,7 @@ def test_no_fault_of_the_bus_gives_wrong_joints(fault: str) -> None:
 
 
 class Unread:
-    """A link whose other side answers when the test does."""
+    """Link without a device: the test itself supplies the answers."""
 
     name = "unread"
 
@@ -119,13 +119,13 @@ class Unread:
 
 
 def pdos(node: int, number: int, copies: int = 1) -> bytes:
-    """Both PDOs of a drive whose position tells the number of the SYNC, each so many times."""
+    """Return both PDOs of a drive, `copies` times each, with the number of the SYNC as position."""
     frames = (0x180, struct.pack("<Hi", 0x27, number)), (0x280, struct.pack("<ih", number, 0))
     return b"".join(copies * Slcan().encode(CanFrame(function + node, data)) for function, data in frames)
 
 
 def test_a_repeated_pdo_is_not_taken_for_the_answer_to_the_next_sync() -> None:
-    """Two SYNCs are under way, and the last drive's answers to the first of them come twice."""
+    """Two SYNCs are unanswered, and the last drive's answers to the first one arrive twice."""
     context, c = Context(name="arm"), ScriptedArm().capabilities()
     options = {"channel": "/dev/unread", "nodes": [*range(1, 7)], "kinematics": kinematics_of(c)}
     device, link = Cia402(context, read_options(context, options, Cia402Options)), cast(Any, Unread())
@@ -190,7 +190,7 @@ def test_a_dead_host_faults_the_drives_by_their_own_watchdog() -> None:
     with wired(far_side := emulator.start(arm, {}), DRIVER, CALM) as device:
         device.enable(deadline=soon())
         until(lambda: arm.is_enabled)
-        device._next_beat_s = float("inf")  # the heartbeat thread of a dead host
+        device._next_beat_s = float("inf")  # no more heartbeats, as from a dead host
         until(lambda: not arm.is_enabled)
         assert far_side.drives[1].state is DriveState.FAULT
 
@@ -226,7 +226,7 @@ def test_a_drive_that_restarts_is_set_up_again_and_stays_off() -> None:
 
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A connection that must fail is given up after 3 s; the drives are asked for what is wrong long before."""
+    """Attempts to connect end after 3 s; the drives are asked for the cause much earlier."""
     monkeypatch.setattr("drivers.cia402.arm.CONNECT_S", 3.0)
 
 
@@ -249,7 +249,7 @@ def test_a_missing_node_is_named() -> None:
 
 
 def test_python_can_and_canopen_drive_the_emulator() -> None:
-    """Other people's stack: NMT, SDO read, write and abort, the 402 states by control words, PDOs on SYNC."""
+    """The emulator works with a third-party stack: NMT, SDO read, write and abort, 402 states, PDOs on SYNC."""
     arm = ScriptedArm()
     far_side = emulator.start(arm, {})
     bus = can.Bus(interface="slcan", channel=far_side.port.address["port"], bitrate=1_000_000, sleep_after_open=0)

@@ -1,4 +1,4 @@
-"""PDOs belong to SYNCs by count: late, lost, repeated and stray ones never pass for the newest."""
+"""PDOs are assigned to SYNCs by counting; late, lost, repeated and stray PDOs are never taken for the newest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def as_data(number: int, pdo: int) -> bytes:
 
 
 class Wire:
-    """Frames of one drive on their way, each with its fate: periods late, holding up those behind it, or lost; once or twice."""
+    """Frames of one drive in transit: each is late by some periods and delays later ones, or is lost, or sent twice."""
 
     def __init__(self, fates: list[Fate], twice: list[bool], *, sdo_later: int) -> None:
         self._fates, self._twice = itertools.cycle(fates), itertools.cycle(twice)
@@ -55,7 +55,7 @@ class Wire:
 def test_each_pdo_is_of_the_sync_that_it_is_said_to_be_of_on_a_drive_that_keeps_order(
     fates: list[Fate], twice: list[bool], standing_for: int
 ) -> None:
-    """What each SYNC finds changes every so many SYNCs: every time when the arm moves, never when it stands."""
+    """The position changes every `standing_for` SYNCs: every time if the arm moves, never if it stands."""
     count, wire, newest = SyncCount(), Wire(fates, twice, sdo_later=0), [0] * PDOS
     for number in range(1, 80):
         if count.wants_probe(number * PERIOD_S):
@@ -67,7 +67,7 @@ def test_each_pdo_is_of_the_sync_that_it_is_said_to_be_of_on_a_drive_that_keeps_
         for data, which in wire.take(number):
             if data is not None and count.took(which, data):
                 newest[which] = struct.unpack("<IB", data)[0]
-            elif data is None and which == count.probes:  # an older one names another object
+            elif data is None and which == count.probes:  # an answer to an older probe names another object
                 count.probe_answered()
             if count.answered is not None:
                 assert newest == [count.answered // standing_for] * PDOS
@@ -76,7 +76,7 @@ def test_each_pdo_is_of_the_sync_that_it_is_said_to_be_of_on_a_drive_that_keeps_
 @pytest.mark.parametrize("sdo_later", [0, 1, 3])
 @pytest.mark.parametrize("standing_for", [1, 1000])
 def test_after_repeats_losses_and_delays_each_sync_is_answered_again(sdo_later: int, standing_for: int) -> None:
-    """A drive answers SDOs in turn or, when it is busy, after younger PDOs; the arm moves or stands."""
+    """The drive answers SDOs in order or, if it is busy, after later PDOs; the arm moves or stands."""
     fates: list[Fate] = [0] * 20 + [2, None, 0, 0, 1, None] + [0] * 7 + [None, 0]
     count, number, answered = SyncCount(), 0, []
     bad, good = Wire(fates, [False, False, True], sdo_later=sdo_later), Wire([0], [False], sdo_later=sdo_later)
@@ -138,7 +138,7 @@ def test_after_a_lost_pdo_a_probe_brings_the_numbers_together() -> None:
     for number in range(1, 6):
         if count.wants_probe(number * PERIOD_S):
             count.probed(number * PERIOD_S)
-            count.probe_answered()  # before the next SYNC's PDOs, as it was asked before
+            count.probe_answered()  # comes before the PDOs of the next SYNC, because the probe was sent before it
         count.synced()
         for pdo in range(PDOS):
             if (number, pdo) != (2, 0):
@@ -211,7 +211,7 @@ def test_a_lost_probe_is_asked_again() -> None:
 
 
 class Drives:
-    """Objects of two drives; the wire breaks before each transfer whose number is in `breaks`."""
+    """Objects of two drives; the link is lost before each transfer whose number is in `breaks`."""
 
     def __init__(self, breaks: set[int]) -> None:
         self.objects = {
@@ -282,7 +282,7 @@ def test_a_drive_that_restarts_while_another_is_set_up_is_set_up_again() -> None
 
 
 class SdoLine(ScriptLink):
-    """An slcan line whose far side answers each request with some frames."""
+    """slcan link whose other end answers each request with some frames."""
 
     def __init__(self, *frames: list[CanFrame]) -> None:
         super().__init__(*(b"".join(map(Slcan().encode, answer)) for answer in frames))

@@ -1,4 +1,4 @@
-"""Dynamixel arm: conformance, stuffing, fast sync read, watchdog, shutdown, faults."""
+"""Tests of the Dynamixel arm: conformance, byte stuffing, fast sync read, watchdog, shutdown, faults."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -33,7 +33,7 @@ class TestDynamixel(ArmContract):
     st.integers(0, 252), st.integers(1, 0x92), st.binary(max_size=60), st.lists(st.integers(min_value=0), max_size=6)
 )
 def test_packets_survive_stuffing_and_any_chunking(id_: int, inst: int, data: bytes, cuts: list[int]) -> None:
-    data = data.replace(b"\x00\x00", protocol.STUFF)  # more headers inside than chance would bring
+    data = data.replace(b"\x00\x00", protocol.STUFF)  # more headers inside than random data contain
     frame = protocol.encode(id_, inst, data)
     assert protocol.HEADER not in frame[4:]
     places = [0, *sorted(cut % (len(frame) + 1) for cut in cuts), len(frame)]
@@ -80,7 +80,7 @@ def test_a_set_point_outlasts_a_busy_bus_and_only_the_newest_is_sent() -> None:
         device.enable(deadline=soon())
         here = device.read_state(deadline=soon()).value.position_rad
         commands = arm.commands
-        with device.bus._lock:  # as while a servo is waited for
+        with device.bus._lock:  # as while the bus waits for a servo
             for step in (0.01, 0.02):
                 device.command_position(here + step, deadline=soon(0.02))
             assert arm.commands == commands
@@ -134,7 +134,7 @@ def test_a_tripped_watchdog_is_told_and_motion_is_off() -> None:
 
 
 def test_a_servo_that_started_again_in_motion_is_told_and_motion_is_off() -> None:
-    """It has no torque then, answers as ever, and would be left behind without a word."""
+    """A restarted servo has no torque but still answers, so without the check the arm would move without it."""
     arm = ScriptedArm()
     with wired(far_side := emulator.start(arm, {}), DRIVER, {"watchdog_s": 0.5}) as device:
         device.enable(deadline=soon())

@@ -1,4 +1,4 @@
-"""The host's side of a Dynamixel bus: an answer that comes too late is never the answer to another request."""
+"""The Dynamixel client never takes a late answer for the answer to another request."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from drivers.transport.link import Link, NoAnswer, Refused, now_s
 
 IDS = (1, 2, 3, 4, 5, 6)
 Fate = Callable[[int, bytes], list[tuple[int, bytes]]]
-"""What becomes of the answer to request number n: pieces, each after so many further requests."""
+"""Splits the answer to request number n into pieces, each arriving after a number of further requests."""
 
 
 class Bus:
-    """Servos whose every register holds the number of the request that it is asked with; some answers come late."""
+    """Servos whose registers all contain the number of the request; some answers come late."""
 
     name, byte_s = "bus", 0.0
 
@@ -74,7 +74,7 @@ def soon() -> float:
 
 @given(st.lists(st.sampled_from([0, 0, 1, 2, None]), min_size=8, max_size=40))
 def test_no_answer_is_older_than_its_question(late: list[int | None]) -> None:
-    """Each answer late by some requests or lost, in order or not."""
+    """Each answer is late by some requests or lost, in order or not."""
 
     def fate(number: int, whole: bytes) -> list[tuple[int, bytes]]:
         later = late[number % len(late)]
@@ -99,7 +99,7 @@ def test_no_late_answer_of_one_servo_is_taken_on_a_bus_that_keeps_order(late: li
         later = late[number % len(late)]
         if later is None:
             return []
-        due = max(due, number + later)  # never before an earlier one
+        due = max(due, number + later)  # never before an earlier answer
         return [(due - number, whole)]
 
     bus, client = client_of(fate)
@@ -132,7 +132,7 @@ def test_a_false_header_makes_no_answer_wait_for_the_bytes_it_promises(false: by
 
 
 class SlowLine(Bus):
-    """A millisecond a byte: who listens for less than that hears nothing."""
+    """At 1 ms per byte, a read that waits for less receives nothing."""
 
     byte_s = 0.001
 

@@ -1,4 +1,4 @@
-"""A gripper on a Dynamixel servo: the conformance kit, the wire's faults, grip by current, torque never by itself."""
+"""Tests of a Dynamixel gripper: conformance, faults of the link, grip by current, no torque unless commanded."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""Watchdogs of emulated arms count the time of the arm behind: a world that stands still for a picture trips none."""
+"""Watchdogs of emulated arms use the backing arm's clock, so a world that stops to render does not trip them."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ ARMS = {
 
 
 def fall_silent(device: Any) -> None:
-    """The host dies: nothing more goes out."""
+    """Simulate a dead host: nothing more is sent."""
     device._next_beat_s = float("inf")
     if hasattr(device, "bus"):
         device.bus.close()
@@ -38,7 +38,7 @@ def test_a_dead_host_is_noticed_when_the_arms_own_time_has_passed_and_not_before
         until(has_moved)
         fall_silent(device)
         ticks = arm.reads
-        until(lambda: arm.reads > ticks + 40)  # looks at the watchdog that last far longer than it, on the wall
+        until(lambda: arm.reads > ticks + 40)  # on the wall clock this takes far longer than the watchdog's time
         assert arm.is_enabled and arm.stops == 0
         arm.device_s = 50.0 + 2.0 * WATCHDOG_S
         until(lambda: not arm.is_enabled)

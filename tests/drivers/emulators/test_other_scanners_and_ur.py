@@ -1,4 +1,4 @@
-"""Other people's clients of scanners and of the UR controller against our emulators; see `test_other_sides` for the rest."""
+"""Third-party clients of scanners and the UR controller with our emulators; see `test_other_sides` for the rest."""
 
 import json
 import math
@@ -70,7 +70,7 @@ pose_roll = 0
 
 
 def is_a_scan(range_m: Any, angle_rad: Any, *, step_m: float) -> bool:
-    """Do the ranges show one of the scripted scans, to the wire's own resolution?"""
+    """Return whether the ranges are one of the scripted scans, to the resolution of the protocol."""
     caps = ScriptedScanner().capabilities()
     true_m = [line_m(RangeImage(depth_m=scripted_scan(k)), caps, np.asarray(angle_rad)) for k in range(100)]
     return any(np.allclose(range_m, m, atol=step_m) for m in true_m)
@@ -78,7 +78,7 @@ def is_a_scan(range_m: Any, angle_rad: Any, *, step_m: float) -> bool:
 
 def test_hokuyolx_reads_parameters_and_scans() -> None:
     hokuyolx: Any = pytest.importorskip("hokuyolx")
-    # A scan in 67 ms: where two arrive before it looks, this client takes them for one and calls the sum wrong.
+    # One scan per 67 ms: if two arrive between its reads, this client takes them for one and reports a wrong checksum.
     far_side = scip.start(ScriptedScanner(), {"transport": "tcp", "scans_per_minute": 900})
     where = (far_side.address["host"], far_side.address["port"])
     laser = hokuyolx.HokuyoLX(addr=where, tsync=False, convert_time=False)
@@ -122,14 +122,14 @@ def test_rplidar_roboticia_reads_identity_health_and_nodes(mode: str, monkeypatc
 
 
 def is_seen(turn: Any) -> bool:
-    """Is a turn (N, 2) of degrees and millimetres one of the scripted scans? Angles come in 1/64 degree or coarser."""
+    """Return whether a turn (N, 2) of degrees and millimetres is a scripted scan, to 1/64 degree or coarser."""
     away_from_seam = turn[np.abs(turn[:, 0] - 180.0) > 1.0]
     angle_rad = (np.deg2rad(away_from_seam[:, 0]) + np.pi) % math.tau - np.pi
     return is_a_scan(away_from_seam[:, 1] / 1000, angle_rad, step_m=0.0021)
 
 
 def test_ur_rtde_reads_the_arm_and_asks_the_dashboard() -> None:
-    """Its clients hold the interpreter while they connect, so they run in a process of their own."""
+    """The clients hold the interpreter lock while they connect, so they run in a separate process."""
     pytest.importorskip("rtde_receive")
     arm = ScriptedArm()
     far_side = ur.start(arm, {"rtde_port": 30_004, "script_port": 30_002, "dashboard_port": 29_999})
@@ -147,7 +147,7 @@ def test_ur_rtde_reads_the_arm_and_asks_the_dashboard() -> None:
 
 
 def test_rawlog_grabber_sets_up_the_lms_200_and_records_its_scans(tmp_path: Path) -> None:
-    """The MRPT grabber finds the power-up baud rate, changes it, sets millimetres and streams; it wants a terminal."""
+    """The MRPT grabber finds the power-up baud rate, changes it, sets millimetres and streams; it needs a terminal."""
     if shutil.which("rawlog-grabber") is None:
         pytest.skip("rawlog-grabber is not installed (Debian package mrpt-apps)")
     far_side = lms200.start(ScriptedScanner(), {})
@@ -161,7 +161,7 @@ def test_rawlog_grabber_sets_up_the_lms_200_and_records_its_scans(tmp_path: Path
                 next(saved)
             assert (far_side.baud, far_side.is_streaming) == (38_400, True)
             os.write(keyboard, b"\x1b")
-            for _ in saved:  # to its end: it dies of a closed pipe
+            for _ in saved:  # read to the end, because the grabber is killed by a closed pipe
                 pass
         assert grabber.returncode == 0
     finally:
@@ -169,7 +169,7 @@ def test_rawlog_grabber_sets_up_the_lms_200_and_records_its_scans(tmp_path: Path
         os.close(terminal)
         far_side.close()
     log = next(tmp_path.glob("*.rawlog"))
-    edit = ["rawlog-edit", "--export-2d-scans-txt", "--input", log.name]  # it joins folders to names without a slash
+    edit = ["rawlog-edit", "--export-2d-scans-txt", "--input", log.name]  # joins folder and name without a slash
     subprocess.run(edit, check=True, capture_output=True, cwd=tmp_path)
     rows = np.loadtxt(next(tmp_path.glob("*_LMS.txt")), comments="%")
     angle_rad = np.deg2rad(np.arange(181) - 90.0)

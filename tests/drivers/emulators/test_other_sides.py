@@ -1,7 +1,8 @@
-"""Other people's clients against our emulators: no protocol may rest on this project's code alone.
+"""Third-party clients with our emulators, so that no protocol is verified by this project's code only.
 
-All of them come with the `test` extra; pymodbus, python-can and canopen prove the rest in test_modbus_io, test_ft300 and
-`cia402`. For LMS 200 there is the Debian package mrpt-apps; for Bota and TFmini there is none (libscrc: their sums).
+The clients are installed by the `test` extra. Further ones, pymodbus, python-can and canopen, are used in
+test_modbus_io, test_ft300 and `cia402`. The client for the LMS 200 is in the Debian package mrpt-apps. There is none
+for Bota and TFmini, so only their checksums are compared, with libscrc.
 """
 
 from typing import Any
@@ -27,7 +28,7 @@ def test_libscrc_agrees(data: bytes) -> None:
 
 def test_dynamixel_sdk_reads_writes_and_sync_reads() -> None:
     sdk: Any = pytest.importorskip("dynamixel_sdk")
-    sdk.port_handler.LATENCY_TIMER = 500  # ms; its 16 are too few on a busy machine
+    sdk.port_handler.LATENCY_TIMER = 500  # ms; the default of 16 ms is too short on a busy machine
     arm = ScriptedArm()
     far_side = dynamixel.start(arm, {})
     port, packet = sdk.PortHandler(far_side.address["port"]), sdk.PacketHandler(2.0)

@@ -1,4 +1,4 @@
-"""The last check of set-points before the drives, and what a stop is worth that comes while they are enabled."""
+"""Tests of the last check of set-points before the drives, and of a stop that comes while they are being enabled."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def make_filter() -> SetPointFilter:
 
 
 class Interrupting:
-    """The arm's speeds; who multiplies them finds that the link is lost at that moment."""
+    """Joint speeds whose multiplication makes the link fail at that moment."""
 
     def __init__(self, speeds: Any, lose: threading.Thread) -> None:
         self._speeds, self._lose = speeds, lose
@@ -40,7 +40,7 @@ def test_a_link_that_is_lost_while_a_set_point_passes_leaves_the_drives_off() ->
     filter_ = make_filter()
     filter_.begin(HERE, closings=0)
     lose = threading.Thread(target=filter_.close)
-    filter_._velocity = Interrupting(filter_._velocity, lose)  # loses the link inside the check
+    filter_._velocity = Interrupting(filter_._velocity, lose)  # the link is lost during the check
     np.testing.assert_allclose(filter_.passed(HERE, 1.0), HERE)
     lose.join()
     assert not filter_.is_open
@@ -59,7 +59,7 @@ def test_a_leap_is_cut_to_what_the_joints_can_do_and_nonsense_is_refused() -> No
 
 
 class StoppingClock(SimClock):
-    """Calls `stop` when it is asked for the time for the n-th time: at a known place inside the call that asks."""
+    """Clock that calls `stop` when its time is read for the n-th time, i.e. at a known point of the caller's code."""
 
     def __init__(self, stop: Callable[[], None], *, at: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""A bus between its owner thread and callers, and the ages of what an emulated wire brings."""
+"""Tests of a bus shared by its owner thread and callers, and of the ages of samples from emulated devices."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WIRE_CELL = Path(__file__).parents[3] / "cells" / "wire-ur.toml"
 
 
 class Greedy:
-    """A station that is always due and holds the bus for two milliseconds."""
+    """Station that is always due and occupies the bus for two milliseconds."""
 
     period_s = 1e-4
 
@@ -31,14 +31,14 @@ class Greedy:
         self._rest = threading.Event()
 
     def set_up(self, client: Link) -> None:
-        """Nothing to set up."""
+        """Do nothing, because there is nothing to set up."""
 
     def poll(self, client: Link) -> None:
         self.polls += 1
         self._rest.wait(0.002)
 
     def fail(self, error: Exception) -> None:
-        """Never called here."""
+        """Do nothing; never called in these tests."""
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def greedy() -> Iterator[tuple[Bus[Link], Greedy]]:
 
 
 class LateLock:
-    """A lock that a caller on a busy machine gets only when it happens to be free each time the caller is awake."""
+    """Lock as seen by a caller on a busy machine, who gets it only if it is free at a moment when the caller runs."""
 
     def __init__(self) -> None:
         self._inner, self._rest = threading.Lock(), threading.Event()
@@ -109,7 +109,7 @@ def test_callers_without_a_pause_do_not_keep_the_polls_away(greedy: tuple[Bus[Li
 
 
 class Silent(WireDevice[int]):
-    """A device that publishes what a test gives it."""
+    """Device that publishes the values that a test gives it."""
 
     kind = DeviceKind.ARM
 
@@ -123,7 +123,7 @@ class Silent(WireDevice[int]):
         return "test"
 
     def release(self) -> None:
-        """Nothing to release."""
+        """Do nothing, because there is nothing to release."""
 
 
 def slow_world(_: float) -> float:
@@ -135,7 +135,7 @@ def slow_world(_: float) -> float:
 
 @pytest.mark.parametrize(("name", "patience"), [("arm", PATIENCE), ("wrist_camera", 1.0)])
 def test_what_an_emulated_wire_brings_ages_in_the_time_of_its_world(name: str, patience: float) -> None:
-    """One tick of 2 ms takes the machine 50 ms: of an emulated device's sample that is 2 ms, of a real one's 50."""
+    """A tick of 2 ms that takes 50 ms of wall time ages an emulated device's sample by 2 ms, a real one's by 50 ms."""
     clock = PacedClock(slow_world)
     device = Silent(Context(name=name, clock=clock, cell=load_cell(WIRE_CELL)), max_age_s=0.02)
     clock.sleep(0.002)

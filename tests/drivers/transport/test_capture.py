@@ -1,4 +1,4 @@
-"""What a driver has read over a wire is read again from a file: same samples, whatever the protocol."""
+"""A capture file of a link gives the same samples when it is replayed, whatever the protocol."""
 
 import json
 import socket
@@ -52,7 +52,7 @@ WANTED = 20
 
 
 def samples_of(device: Any, wanted: int) -> list[Stamped[Any]]:
-    """The first samples in the mailbox, all of them."""
+    """Return the first samples of the mailbox without gaps."""
     until(lambda: device.mailbox.published >= wanted, within_s=10.0)
     found, lost = device.mailbox.since(0)
     assert not lost
@@ -60,7 +60,7 @@ def samples_of(device: Any, wanted: int) -> list[Stamped[Any]]:
 
 
 def plain(sample: Stamped[Any]) -> tuple[Any, ...]:
-    """All that a sample says but its host time."""
+    """Return all fields of a sample except its host time."""
     value = sample.value
     told = value.depth_m.tobytes() if isinstance(value, RangeImage) else repr(value)
     return told, sample.sequence, sample.device_time_s, sample.quality, sample.cause
@@ -83,7 +83,7 @@ def test_the_replay_of_a_capture_gives_the_same_samples(name: str, tmp_path: Pat
 
 
 def test_drives_that_their_host_paces_are_replayed_too(tmp_path: Path) -> None:
-    """SYNC and heartbeat keep the host's time, so that not each sample of a busy recording comes again."""
+    """SYNC and heartbeat follow the host's clock, so not every sample of a recording on a busy machine is replayed."""
     path, arm = tmp_path / "capture.jsonl", scripted.ScriptedArm()
     with closing(cia402.start(arm, {})) as far_side:
         options = far_side.address
@@ -107,7 +107,7 @@ def test_the_end_of_a_recording_is_the_loss_of_the_device(tmp_path: Path) -> Non
 
 
 def session(path: Path, *events: tuple[float, str, bytes]) -> Link:
-    """A replay of these events."""
+    """Return a replay of these events."""
     lines = [{"t": t, "dir": direction, "hex": data.hex()} for t, direction, data in events]
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     return replay_opener(path, "dut")()
@@ -125,7 +125,7 @@ def test_an_answer_is_held_back_until_its_request_is_written(tmp_path: Path) -> 
 def test_a_request_that_nobody_makes_is_passed_over(tmp_path: Path) -> None:
     link = session(tmp_path / "c", (0.0, "tx", b"beat"), (0.002, "rx", b"data"), (0.01, "rx", b"more"))
     assert link.read(now_s() + 2.0) == b"data"
-    link.write(b"beat", now_s() + 1.0)  # too late; nothing is skipped for it
+    link.write(b"beat", now_s() + 1.0)  # too late; nothing is skipped because of it
     assert link.read(now_s() + 1.0) == b"more"
 
 
@@ -162,7 +162,7 @@ def test_a_write_that_was_never_recorded_changes_nothing(tmp_path: Path) -> None
 
 
 class TwiceLost:
-    """A port that brings one chunk at each opening and is gone."""
+    """Port that delivers one chunk after each opening and is then lost."""
 
     name, byte_s = "wire", 1e-4
 
@@ -175,13 +175,13 @@ class TwiceLost:
         return self.chunks.pop()
 
     def write(self, data: bytes, until_s: float) -> None:
-        """Into the void."""
+        """Discard the data."""
 
     def is_present(self) -> bool:
         return True
 
     def close(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Check sums against their published check values and against bit-by-bit definitions."""
+"""Compares checksums with published check values and with bit-by-bit definitions."""
 
 import binascii
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def test_the_nine_digits_give_the_published_check_value(check: Callable[[bytes],
 
 
 def bitwise(data: bytes, *, poly: int, start: int) -> int:
-    """CRC by its definition, one bit at a time, least significant bit first."""
+    """Return a CRC by its definition, one bit at a time, least significant bit first."""
     crc = start
     for byte in data:
         crc ^= byte

@@ -1,4 +1,4 @@
-"""The framer finds every true frame for any chunking and any noise, and no decoy."""
+"""The framer finds all true frames and no false ones, for any chunking and any noise."""
 
 from itertools import pairwise
 

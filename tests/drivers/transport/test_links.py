@@ -1,4 +1,4 @@
-"""Serial lines, TCP, UDP and bare descriptors as links: bytes both ways, losses and refusals told."""
+"""Serial lines, TCP, UDP and bare descriptors as links carry bytes both ways and report losses and refusals."""
 
 from __future__ import annotations
 

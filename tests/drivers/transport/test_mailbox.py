@@ -1,4 +1,4 @@
-"""The mailbox between an owner thread and its readers."""
+"""Tests of the mailbox between an owner thread and its readers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.drivers.rigs import later, until
 
 @contextmanager
 def reading(box: Mailbox[int]) -> Iterator[list[int | None]]:
-    """A reader in a thread of its own; its value is there at the end, at the latest after 30 s."""
+    """Read in another thread; the yielded list holds the value after the `with` block, which waits for at most 30 s."""
     got: list[int | None] = []
 
     def read() -> None:
@@ -72,7 +72,7 @@ def test_a_waiting_reader_wakes_with_the_sample() -> None:
 
 @pytest.fixture
 def busy_switching() -> Iterator[None]:
-    """The interpreter changes threads after nearly every instruction, so that no gap between two of them stays hidden."""
+    """Make the interpreter switch threads after nearly every instruction, to reveal race conditions."""
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(1e-7)
     yield
@@ -81,7 +81,7 @@ def busy_switching() -> Iterator[None]:
 
 @pytest.mark.usefixtures("busy_switching")
 def test_no_reader_misses_its_waking_and_none_gets_a_sample_twice() -> None:
-    """Writer and readers in lock step: each sample is published only when every reader waits for it or is about to."""
+    """Writer and readers run in lock step: a sample is published only when every reader waits or is about to wait."""
     box: Mailbox[int] = Mailbox()
     rounds, readers = 1000, 3
     got: list[list[int]] = [[] for _ in range(readers)]
@@ -98,7 +98,7 @@ def test_no_reader_misses_its_waking_and_none_gets_a_sample_twice() -> None:
         thread.start()
     for i in range(1, rounds + 1):
         box.publish(Stamped(value=i, host_time_s=float(i), sequence=i))
-        has_all.wait(30.0)  # a lost waking leaves its reader waiting for 60 s, and breaks the barrier
+        has_all.wait(30.0)  # after a lost wake-up the reader would wait for 60 s and break the barrier
     assert got == [list(range(1, rounds + 1))] * readers
 
 

@@ -1,4 +1,4 @@
-"""Modbus masters over scripted links: whose answer is whose."""
+"""Modbus masters over scripted links assign answers to the right requests."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_rtu_takes_an_answer_among_noise_echo_and_a_false_header() -> None:
 
 def test_rtu_never_takes_a_late_answer_for_the_next() -> None:
     old, young = rtu("0902 01 55"), rtu("0902 01 aa")
-    probe = rtu("0983 02")  # exception of the function that is asked in between
+    probe = rtu("0983 02")  # exception to the function of the probing request
     link = ScriptLink(b"", old + probe, young)
     master = ModbusRtu(link, timeout_s=0.01, gap_s=0.0, quarantine_s=0.0)
     with pytest.raises(NoAnswer):
@@ -38,7 +38,7 @@ def test_rtu_never_takes_a_late_answer_for_the_next() -> None:
 
 
 def test_a_slave_that_knows_registers_only_is_heard_again_at_once_after_a_lost_answer() -> None:
-    """Grippers and force sensors leave requests for bits without any answer."""
+    """Grippers and force sensors do not answer requests for bits at all."""
     link = ScriptLink(b"", rtu("0984 02"), rtu("0903 02 00aa"))
     master = ModbusRtu(link, timeout_s=0.01, gap_s=0.0, quarantine_s=0.0)
     with pytest.raises(NoAnswer):
@@ -104,7 +104,7 @@ def test_exceptions_name_the_function_and_a_remedy() -> None:
 
 def test_answers_that_come_too_late_are_told_with_the_option_that_waits_longer() -> None:
     link = ScriptLink(b"")
-    link.ready = rtu("0902 01 55")  # of an earlier request
+    link.ready = rtu("0902 01 55")  # answer to an earlier request
     with pytest.raises(NoAnswer, match=r"later than `timeout_s` = 0.01 s: 6"):
         ModbusRtu(link, timeout_s=0.01, gap_s=0.0).read_bits(unit=9, address=0, count=2, until_s=later(0.0))
 

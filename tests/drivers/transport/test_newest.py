@@ -1,4 +1,4 @@
-"""What a wired device gives out is never older than it promises, however long its reader has waited."""
+"""A device never returns a sample older than it promises, however long its reader has waited."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_AGE_S = 0.05
 
 
 class Bare(WireDevice[str]):
-    """A device without a wire: the test publishes."""
+    """Device without a link; the test publishes its samples."""
 
     kind = DeviceKind.PROXIMITY
 
@@ -40,9 +40,9 @@ def test_a_sample_that_was_held_up_on_the_wire_is_not_given_out_when_it_has_grow
     device, got = Bare(Context(name="late", clock=clock), max_age_s=MAX_AGE_S), list[Stamped[str]]()
     reader = threading.Thread(target=lambda: got.append(device.newest(Deadline.after(clock, 30.0))), daemon=True)
     reader.start()
-    until(lambda: len(device.mailbox._bells) > 0)  # it waits for a sample that was valid at 9.95 s or later
+    until(lambda: len(device.mailbox._bells) > 0)  # the reader waits for a sample that is valid at 9.95 s or later
     clock.set_now_s(10.2)
-    device.publish("held up", valid_s=now_s() - 0.22)  # valid at 9.98 s, and here at 10.2 s
+    device.publish("held up", valid_s=now_s() - 0.22)  # was valid at 9.98 s and arrives at 10.2 s
     until(lambda: got != [] or len(device.mailbox._bells) > 0)
     device.publish("fresh", valid_s=now_s())
     reader.join(30.0)

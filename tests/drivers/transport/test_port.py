@@ -1,4 +1,4 @@
-"""The owner thread of a port: set up anew after each loss."""
+"""The owner thread of a port sets it up again after each loss."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.drivers.rigs import ScriptLink, later, until
 
 
 class Tenant:
-    """Counts its calls; serves until told to lose the link."""
+    """Counts its calls and serves until told to lose the link."""
 
     def __init__(self) -> None:
         self.set_ups = 0
@@ -37,7 +37,7 @@ class Tenant:
 
 
 class Waiter(Tenant):
-    """Waits a minute for an answer in its set-up."""
+    """Waits for an answer during set-up for one minute."""
 
     def __init__(self) -> None:
         super().__init__()

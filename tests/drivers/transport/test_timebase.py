@@ -1,4 +1,4 @@
-"""Device clocks on the host's: wraps, late frames, drift, restarts."""
+"""Tests of the conversion of device clocks to host time: wraps, late frames, drift, restarts."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_a_restarted_device_clock_starts_a_new_estimate() -> None:
 
 
 def _errors_s(sent_s: list[float], late_s: list[float]) -> list[float]:
-    """Stamp less time of sending, for frames that this host sees late."""
+    """Return stamp minus time of sending, for frames that the host receives late."""
     times = FrameTimes(period_s=0.01, frame_bytes=9)
     errors_s, seen_s = [], 0.0
     for number, (sent, late) in enumerate(zip(sent_s, late_s, strict=True)):
@@ -123,7 +123,7 @@ def test_a_period_that_was_told_wrong_makes_no_stamp_older_than_one_such_period(
 
 
 def opened_anew(device_first_s: float, arrived_first_s: float) -> float:
-    """Stamp of the first frame after a loss; before it the device's clock was 100 s behind the host's."""
+    """Return the stamp of the first frame after a loss; before it the device clock was 100 s behind the host's."""
     host = HostTime()
     for i in range(200):
         host.host_s(device_s=0.01 * i, arrived_s=100.0 + 0.01 * i + 0.001)
@@ -149,7 +149,7 @@ def test_an_exchange_that_lasts_claims_nothing_for_the_time_that_it_waited() -> 
 
 @given(st.lists(st.tuples(st.floats(0, 0.01), st.floats(0, 0.1), st.floats(0, 0.1)), min_size=1, max_size=200))
 def test_no_answer_looks_younger_than_half_of_the_shortest_exchange(waits: list[tuple[float, float, float]]) -> None:
-    """Each exchange: the wire's part, waiting before the value is taken, waiting after it."""
+    """Each exchange has a link time, a wait before the value is taken, and a wait after it."""
     exchanges, asked_s, shortest_s = ExchangeTime(), 0.0, 1.0
     for wire_s, before_s, after_s in waits:
         lasted_s = wire_s + before_s + after_s

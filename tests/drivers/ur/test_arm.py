@@ -1,4 +1,4 @@
-"""UR arm: conformance over RTDE and script port, watchdog, protective stop, recipes, the guide's packages."""
+"""Tests of the UR arm: conformance over RTDE and script port, watchdog, protective stop, recipes, known packages."""
 
 import struct
 from collections.abc import Iterator
@@ -63,7 +63,7 @@ def test_lost_and_foreign_bytes_cost_the_packages_beside_them_and_no_more() -> N
     parser = rtde.PackageParser()
     parser.data_size = 28
     found = parser.feed(packages[0] + packages[1][:-2] + packages[2] + b"\x00\x1c" + packages[3] + packages[4])
-    # 2 was cut; 3 is followed by bytes that begin nothing, so it cannot be told from a cut one either
+    # 2 was cut; 3 is followed by bytes that begin no package, so it cannot be distinguished from a cut one
     assert [body[0] for _, body in found] == [1, 4, 5]
 
 
@@ -83,9 +83,7 @@ def test_a_package_that_lost_bytes_is_no_sample_even_where_nothing_tells_what_fo
     del cut[lost]
     heard = wires[0] + bytes(cut) + wires[2]
     gone = len(wires[1]) - len(cut)
-    first = 2 * len(
-        wires[0]
-    )  # as long as a package was promised, with the head of the next in the place of what was lost
+    first = 2 * len(wires[0])  # the announced length of a package, filled up with the head of the next one
     found = [v["timestamp"] for chunk in (heard[:first], heard[first:]) for v in session.take(chunk)]
     assert gone and found in ([1.0], [1.0, 3.0])
 
@@ -99,7 +97,7 @@ def test_no_fault_of_the_net_gives_wrong_joints(fault: str) -> None:
 
 
 def follow(device: Any, arm: ScriptedArm, goal: Any) -> None:
-    """Stream a set-point until the arm has taken it."""
+    """Stream a set-point until the arm has reached it."""
 
     def has_arrived() -> bool:
         device.command_position(goal, deadline=soon())

@@ -1,4 +1,4 @@
-"""Lights and touch on a UR controller's digital points: the conformance kit, faults, refusals."""
+"""Tests of lights and touch pads on the digital points of a UR controller: conformance, faults, refusals."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""A panel file with what cannot be meant is refused with all its faults at once, each with key, value and remedy."""
+"""An invalid panel file is refused with all its faults at once, each with key, value and remedy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def faults(*objects: str) -> list[str]:
 
 
 def test_a_scale_in_degrees_under_a_key_for_radians_is_refused_and_says_so() -> None:
-    """Such a gauge was once read as 7.88 bar instead of 1.08 with a confidence of 0.999."""
+    """With such a scale a gauge at 1.08 bar would be read as 7.88 bar with a confidence of 0.999."""
     found = faults(GAUGE + SCALE % "at_min = -135.0, at_max = 135.0")
     assert len(found) == 2
     assert all("rad is beyond a full turn" in one for one in found)
@@ -91,7 +91,7 @@ def test_what_cannot_be_meant_is_refused_with_a_remedy(keys: str, says: str) -> 
 
 
 def test_all_faults_are_told_at_once() -> None:
-    """Also those of places, which could be looked for only when everything else is right."""
+    """This includes faults of positions, which otherwise could be found only if everything else is right."""
     found = faults(
         GAUGE + SCALE % "at_min = -135.0, at_max = 135.0",
         'kind = "lamp"\nname = "run"\nposition_m = [0.1, 0.0]\nradius_m = 0.01',

@@ -1,7 +1,7 @@
-"""One dial that fills the picture, with nothing taught but the ends of its scale: photographs of meters and gauges.
+"""Reader of one dial that fills a photograph of a meter or gauge; nothing is taught but the ends of its scale.
 
-The pointer may differ from the face in colour rather than in brightness, so it is looked for in several channels of the
-picture and the clearest one is believed.
+The pointer may differ from the face in colour rather than in brightness, so it is searched for in several channels of
+the picture, and the clearest one is used.
 """
 
 from __future__ import annotations
@@ -23,39 +23,43 @@ from perception.vision.reading import ANSWER_AT, PatchReading, answer_at, gated,
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
 from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
 
-NUMERALS_FROM, TIP_AT = 0.45, 0.72  # share of the radius: beyond any round hub, within every pointer
-LEAST_CONNECTED = 0.7  # of the way to the hub: a pointer comes from it, a glare or a numeral does not
-SAME_RAD = np.deg2rad(6.0)
+NUMERALS_FROM, TIP_AT = 0.45, 0.72  # shares of the radius: beyond any round hub, and within every pointer
+LEAST_CONNECTED = 0.7  # share of the way to the hub; a pointer comes from the hub, unlike glare or a numeral
+SAME_RAD = np.deg2rad(6.0)  # pointers in different channels with a smaller difference are the same
 COLOUR_OFF_RAD = np.deg2rad(
     14.0
-)  # JPEG keeps colours by blocks of 16 px: a pointer of its own gray is that far off there
-SHOWN_WELL = 0.5  # confidence
-SURE, CONTRADICTED = 0.8, 0.6  # confidence of a needle; of a drop where a sure needle points elsewhere
-RIVALLED = 0.8  # of the confidence of a needle that is not sure where a drop may point elsewhere
-OTHER_RAD = np.deg2rad(35.0)  # one side of a drop may be a needle
-CLEARER_BY = 0.5  # than the best pointer elsewhere, as `_clearness` counts
-BRIGHT_FACE = 205  # gray level
-PIVOT_OFF = 0.08  # of the radius: seen aslant, the outline found is not about the pivot
-LEAST_COLOUR = 5.0  # of Lab: less is the noise of a camera or of JPEG
-SCALE_END_RAD = np.deg2rad(135.0)  # three quarters of a turn is what almost all round gauges use
-USUAL_RAD = np.deg2rad(10.0)  # ticks that end so near to it mean it: one tick more or less
-SAME_SPAN_RAD, TURNED_RAD = np.deg2rad([5.0, 3.0])  # unless all is turned: the photograph or the gauge is not upright
-LOPSIDED_RAD = np.deg2rad(10.0)  # middle of another span from straight up: then ticks at one end do not show
-BY_TICKS = 0.75  # confidence: an end may be a tick off
+)  # JPEG stores colours in blocks of 16 px, which may shift a pointer's direction by so much
+SHOWN_WELL = 0.5  # confidence from which the direction in lightness is used
+SURE, CONTRADICTED = 0.8, 0.6  # confidence of a certain needle; and of a drop that contradicts it
+RIVALLED = 0.8  # factor on the confidence of an uncertain needle if a drop may point elsewhere
+OTHER_RAD = np.deg2rad(35.0)  # largest angle at which one side of a drop may be taken for a needle
+CLEARER_BY = 0.5  # than the best pointer elsewhere, in units of `_clearness`, for a confidence of one half
+BRIGHT_FACE = 205  # gray level of a face on which saturated parts need not be glare
+PIVOT_OFF = 0.08  # of the radius; in an oblique view the outline is not centred on the pivot
+LEAST_COLOUR = 5.0  # contrast in units of Lab; a smaller one may be noise of the camera or of JPEG
+SCALE_END_RAD = np.deg2rad(135.0)  # almost all round gauges use three quarters of a turn
+USUAL_RAD = np.deg2rad(10.0)  # ticks that end so near to that mean it, with one tick more or less
+# A scale with the usual span whose middle is off by more than TURNED_RAD is rotated as a whole.
+SAME_SPAN_RAD, TURNED_RAD = np.deg2rad([5.0, 3.0])
+# If the middle of another span is farther from straight up, the ticks at one end are not visible.
+LOPSIDED_RAD = np.deg2rad(10.0)
+BY_TICKS = 0.75  # confidence, because an end may be off by one tick
 
 
 def read_dial(
     image: NDArray[Any], *, minimum: float, maximum: float, circular: bool, ends_rad: tuple[float, float] | None = None,
     least_confidence: float = ANSWER_AT,
 ) -> PatchReading:  # fmt: skip
-    """Value of the dial that fills the picture.
+    """Read the dial that fills the picture.
 
     Args:
         image: gray or RGB uint8, cropped to the dial.
-        circular: the scale is a full turn that begins straight up.
-        ends_rad: pointer angles at minimum and maximum of a scale that is not; when None, where its ticks end, and three
-            quarters of a turn where they do not tell.
-        least_confidence: as of `taught.inspect`.
+        minimum, maximum: ends of the scale.
+        circular: whether the scale is a full turn that begins straight up.
+        ends_rad: pointer angles at minimum and maximum of a scale that is not circular. If None, they are the ends of
+        the
+            ticks, or three quarters of a turn if these are not found.
+        least_confidence: as of `inspection.inspect`.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
@@ -78,7 +82,7 @@ def read_dial(
 
 
 def _at_reading_size(image: NDArray[Any]) -> tuple[Image, tuple[float, float, float]]:
-    """The picture with a side of `SIDE_PX`, and the dial in it: u, v and radius."""
+    """Return the picture with its longer side scaled to `SIDE_PX`, and the dial in it: u, v and radius."""
     scale = SIDE_PX / max(image.shape[:2])
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     picture = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation), np.uint8)
@@ -86,7 +90,7 @@ def _at_reading_size(image: NDArray[Any]) -> tuple[Image, tuple[float, float, fl
 
 
 def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[tuple[float, float], float]:
-    """Pointer angles at minimum and maximum, and the largest confidence that they justify."""
+    """Return the pointer angles at minimum and maximum, and the largest confidence that they justify."""
     usual = (-SCALE_END_RAD, SCALE_END_RAD)
     by_ticks = scale_ends(gray, u, v, radius)
     if by_ticks is None:
@@ -100,7 +104,7 @@ def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[tuple[float, 
 
 
 def _pointer(picture: Image, u: float, v: float, radius: float) -> tuple[PointerFit, float] | None:
-    """The pointer and the largest confidence that it justifies; None where nothing stands out."""
+    """Return the pointer and the largest confidence that it justifies; None if none stands out."""
     drop, by_sides = find_drop(picture, u, v, radius)
     if drop is not None:
         return drop.fit, drop.most
@@ -118,7 +122,7 @@ def _pointer(picture: Image, u: float, v: float, radius: float) -> tuple[Pointer
 
 
 def _lines(picture: Image, u: float, v: float, radius: float) -> tuple[list[PointerFit], list[PointerFit]]:
-    """Needle candidates in lightness, and in the other channels, of either polarity."""
+    """Return needle candidates in lightness, and those in the other channels, dark and bright."""
     gray = as_gray(picture)
     glare = _glare(gray, u, v, radius)
     fits: list[list[PointerFit]] = []
@@ -140,9 +144,9 @@ def _lines(picture: Image, u: float, v: float, radius: float) -> tuple[list[Poin
 
 
 def _believed(in_gray: list[PointerFit], in_colour: list[PointerFit]) -> tuple[PointerFit, PointerFit | None]:
-    """The pointer that is read, and the clearest other one.
+    """Return the pointer to be read, and the clearest one in another direction.
 
-    Lightness is sharper than colour: where it shows the clearest pointer well, its direction is used.
+    Lightness is sharper than colour, so its direction is used if it shows the clearest pointer well.
     """
     fits = in_gray + in_colour
     best, same_rad = max(fits, key=_clearness), SAME_RAD
@@ -154,27 +158,32 @@ def _believed(in_gray: list[PointerFit], in_colour: list[PointerFit]) -> tuple[P
 
 
 def _agreement(best: PointerFit, rival: PointerFit | None) -> float:
-    """Largest confidence given the other channels: too low for an answer if a clear one points elsewhere."""
+    """Return the largest confidence given the other channels: too low for an answer if a clear one points elsewhere."""
     if rival is None:
         return 1.0
     return float(1.0 / (1.0 + np.exp(-(_clearness(best) - _clearness(rival) - CLEARER_BY) / 0.3)))
 
 
 def _apart(one: PointerFit, other: PointerFit) -> float:
+    """Return the angle between two pointers."""
     return float(abs(wrapped(np.array(one.angle_rad - other.angle_rad))))
 
 
 def _confidence(fit: PointerFit) -> float:
+    """Return the confidence of a needle."""
     return pointer_confidence(fit, 1.0, rival=RIVAL, sigma_rad=SIGMA_RAD)
 
 
 def _clearness(fit: PointerFit) -> float:
+    """Return how clearly a needle stands out; for comparison with other needles."""
     return float(np.log(fit.strength) + 3.0 * (1.0 - fit.rival_ratio) + 2.0 * fit.supported)
 
 
 def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] | None:
-    """(H, W) saturated spots, with their halos, that do not come from the dial's middle as a pointer does; None where there
-    are none, or where the face is so bright that a saturated part of it need not be a glare."""
+    """Return a mask (H, W) of saturated spots, with halos, that do not come from the dial's middle as a pointer does.
+
+    None if there are none, or if the face is so bright that a saturated part of it need not be glare.
+    """
     y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
     away = np.hypot(x - u, y - v)
     face = float(np.median(gray[away < radius]))
@@ -190,7 +199,7 @@ def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] 
 
 
 def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
-    """Share of the way from the hub to the numerals that resembles the outer pointer rather than the face."""
+    """Return the share of the way from hub to numerals that resembles the outer pointer rather than the face."""
     turn = np.linspace(-np.pi, np.pi, 180)
     outer = np.linspace(NUMERALS_FROM, TIP_AT, 12) * radius
     inner = np.linspace(0.15, NUMERALS_FROM, 12) * radius
@@ -200,7 +209,7 @@ def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
     contrast = float(np.median(pointer - face))
     if contrast == 0:
         return 0.0
-    # The pivot may lie off the dial's middle: the way in is a strip, as wide as that.
+    # The pivot may be off the dial's middle, so a strip of that width is searched.
     off = np.linspace(-PIVOT_OFF, PIVOT_OFF, 9) * radius
     x = inner[:, None] * np.sin(angle_rad) + off * np.cos(angle_rad)
     y = inner[:, None] * np.cos(angle_rad) - off * np.sin(angle_rad)
@@ -209,7 +218,7 @@ def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
 
 
 def _channels(image: Image, gray: Image, disc: NDArray[np.bool_]) -> list[tuple[Image, float]]:
-    """Pictures in which a pointer may stand out, darker or brighter than the face, and the least contrast there."""
+    """Return pictures in which a pointer may stand out, each with the least contrast that counts there."""
     channels = [(gray, 0.0)]
     if image.ndim == 3:
         lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
@@ -224,6 +233,7 @@ def _channels(image: Image, gray: Image, disc: NDArray[np.bool_]) -> list[tuple[
 
 
 def _patch(channel: Image, u: float, v: float) -> Patch:
+    """Return a channel as a patch with the dial's middle as origin and pixels as unit."""
     return Patch(
         gray=channel, colour=None, inside=np.ones(channel.shape, bool), px_per_m=1.0, image_px_per_m=1.0,
         origin_px=np.array([u, v]), parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,

@@ -1,4 +1,4 @@
-"""The round outline of a dial that fills the picture: middle and radius."""
+"""Search for the round outline of a dial that fills the picture: its middle and radius."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ from perception.vision.finding.circles import Circle, find_circles
 from perception.vision.finding.shapes import find_edges
 
 SIDE_PX = 220
-LEAST_SIDE_PX = 90
-UNSEEN_RIM = 0.48  # of the picture: the radius where no outline is found
-WHOLE = 0.9  # of the best coverage: the arc of a scale covers three quarters of a turn
+LEAST_SIDE_PX = 90  # smaller pictures are enlarged to this
+UNSEEN_RIM = 0.48  # of the picture's side: the radius if no outline is found
+# Least coverage of an outline, relative to the best one; the arc of a scale covers only three quarters of a turn.
+WHOLE = 0.9
 TURNS = np.linspace(0, 2 * np.pi, 120, endpoint=False)
 NORMALS = np.column_stack([np.sin(TURNS), -np.cos(TURNS)])
-REACHES = (0.12, 0.07, 0.04, 0.04)  # of the radius, to either side of the outline so far
-LEAST_SLOPE = 0.3  # of the median along the outline
+REACHES = (0.12, 0.07, 0.04, 0.04)  # of the radius, on either side of the current outline
+LEAST_SLOPE = 0.3  # relative to the median along the outline
 
 
 def dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
-    """Middle and radius, both times `scale`, of the round outline of the face about the picture's middle, or of the picture.
+    """Return middle and radius of the face's round outline near the picture's middle, both multiplied by `scale`.
 
-    A bezel has an outline to either side, and what stands before the plate is displaced: the inner one is the face's.
-    A small picture is looked at in about its own size: blown up, its edges would be too faint.
+    Of the two outlines of a bezel the inner one is that of the face; the outer one is displaced, because it stands out
+    of the plate. If there is no outline, the result is the inscribed circle of the picture. A small picture is searched
+    at about its own size, because enlarged edges would be too faint.
     """
     own = np.clip(max(gray.shape), LEAST_SIDE_PX, SIDE_PX) / max(gray.shape)
     interpolation = cv2.INTER_AREA if own < 1 else cv2.INTER_CUBIC
@@ -46,9 +48,9 @@ def dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
 
 
 def _settled(picture: Image, circle: Circle) -> tuple[float, float, float]:
-    """Middle and radius fitted to the steepest change across the outline, of the sign that prevails along it.
+    """Return middle and radius fitted to the steepest change across the outline, of the sign that prevails along it.
 
-    Votes leave a circle anywhere on a wide edge.
+    This is needed because votes may place a circle anywhere on a wide edge.
     """
     smooth: Image = np.ascontiguousarray(cv2.GaussianBlur(picture, (0, 0), 1.0), np.uint8)
     u, v, radius = circle.u, circle.v, circle.radius

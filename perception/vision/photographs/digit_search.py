@@ -1,8 +1,8 @@
-"""Where rows of seven-segment digits are in a picture of which nothing is known: cells of seven segments, sought everywhere.
+"""Search for rows of seven-segment digits in a picture of which nothing is known.
 
-The picture is scaled so that a digit of each height tried becomes CELL_PX high; there, for dark and for bright ink, two slants
-and two widths, every place's cell is judged by the share of the ink around it that its best character explains. Neighbouring
-good cells of one height and polarity make a row. Nothing is asked of window, frame or contrast.
+The picture is scaled so that a digit of each tried height becomes CELL_PX high. Then, for dark and for bright ink, two
+slants and two widths, the cell at every place is scored by the share of the ink around it that its best character
+explains. Neighbouring good cells of the same height and polarity form a row. Window, frame and contrast are not used.
 """
 
 from __future__ import annotations
@@ -20,25 +20,27 @@ from perception.vision.noise import noise_sigma
 from perception.vision.status.digit_grid import LIT_SHARES
 from perception.vision.status.digit_grid_worth import Float32, cell_boxes
 
-CELL_PX = 24.0  # between the axes of the top and bottom segments
-STRIDE = 2
-STEP = 1.25  # between the heights tried
-LEAST_PX, MOST_SHARE = 18.0, 0.7  # of a digit: in the picture; of its smaller side
-SLANTS = (0.02, 0.15)
-WIDTHS = (0.44, 0.56)
+CELL_PX = 24.0  # distance between the axes of the top and bottom segments
+STRIDE = 2  # distance in px between the tried places
+STEP = 1.25  # ratio of successive heights
+# Least height of a digit in the picture, and its largest ratio to the picture's smaller side.
+LEAST_PX, MOST_SHARE = 18.0, 0.7
+SLANTS = (0.02, 0.15)  # tried tangents of the digits' slant
+WIDTHS = (0.44, 0.56)  # tried ratios of width to height
 KERNEL_PX = 13  # wider than any stroke of such a digit
-MARGIN = 0.16  # of the height, around a cell: ink there counts as not explained
+MARGIN = 0.16  # of the height, around a cell; ink there counts as unexplained
 LEAST_SHARE = 0.35  # of the ink explained
 NOISE_SIGMAS = 2.0
-PLAIN = 0.3  # what a cell of few segments counts: any bar looks like a one
+PLAIN = 0.3  # factor on the score of a cell with few segments, because any bar resembles a one
 MOST_CELLS = 60
 MOST_ROWS = 8
-SAME_HEIGHT, SAME_ROW, NEXT_CELL = 1.35, 0.3, 2.2  # cells of one row: ratio of heights; distances over the height
+# For cells of one row: ratio of heights, and distances relative to the height.
+SAME_HEIGHT, SAME_ROW, NEXT_CELL = 1.35, 0.3, 2.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DigitCell:
-    """A place that looks like a digit: upper left corner of its axes, size, all px of the picture; and how well, 0 to 1."""
+    """A place that resembles a digit: upper left corner of its axes and size, px of the picture; score, 0 to 1."""
 
     u: float
     v: float
@@ -50,7 +52,7 @@ class DigitCell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DigitRow:
-    """Cells side by side: the box around their axes, px, the height of a digit, polarity, and the sum of their scores."""
+    """Cells side by side: the box around their axes, px; height of a digit; polarity; sum of their scores."""
 
     left: float
     top: float
@@ -62,7 +64,7 @@ class DigitRow:
 
 
 def find_digit_rows(gray: Image) -> list[DigitRow]:
-    """The likeliest rows of digits, best first, at most MOST_ROWS.
+    """Return the likeliest rows of digits, best first, at most MOST_ROWS.
 
     Args:
         gray: (H, W) uint8.
@@ -78,6 +80,7 @@ def find_digit_rows(gray: Image) -> list[DigitRow]:
 
 
 def _cells(gray: Image) -> Iterator[DigitCell]:
+    """Yield the cells of all tried heights and both polarities."""
     height = LEAST_PX
     while height <= MOST_SHARE * min(gray.shape):
         scale = CELL_PX / height
@@ -90,7 +93,7 @@ def _cells(gray: Image) -> Iterator[DigitCell]:
 
 
 def _ink(small: Image, is_dark: bool) -> Float32:
-    """White or black hat minus the noise."""
+    """Return the ink: bright or dark strokes by a white or black top-hat, minus the noise."""
     smooth = cv2.GaussianBlur(small, (3, 3), 0)
     operation = cv2.MORPH_BLACKHAT if is_dark else cv2.MORPH_TOPHAT
     hat = cv2.morphologyEx(smooth, operation, np.ones((KERNEL_PX, KERNEL_PX), np.uint8)).astype(np.float32)
@@ -98,6 +101,7 @@ def _ink(small: Image, is_dark: bool) -> Float32:
 
 
 def _cells_of_height(ink: Float32, is_dark: bool, scale: float) -> Iterator[DigitCell]:
+    """Yield the cells in a picture that is scaled by `scale`."""
     middle = (len(ink) - 1) / 2
     for slant in SLANTS:
         shear = np.array([[1.0, -slant, slant * middle], [0.0, 1.0, 0.0]])
@@ -116,7 +120,7 @@ def _cells_of_height(ink: Float32, is_dark: bool, scale: float) -> Iterator[Digi
 
 
 def _peaks(scores: Float32) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the local maxima above the threshold."""
+    """Return rows and columns of the local maxima above the threshold."""
     near = cv2.dilate(scores, np.ones((5, 5), np.uint8))
     rows, columns = np.nonzero((scores >= near) & (scores > LEAST_SHARE * PLAIN))
     return rows, columns
@@ -124,12 +128,15 @@ def _peaks(scores: Float32) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 @compiled
 def cell_scores(sums: Array, squares: Array, boxes: Array, width: float, lit: Array) -> Float32:
-    """Share of the ink's energy around a cell that its best character explains, for cells at every STRIDE px.
+    """Return the share of the ink's energy around a cell that its best character explains, for cells at all places.
 
     Args:
         sums, squares: integral images of the upright ink, and of its square.
         boxes: (9, 4) of a cell at the origin (see `digit_grid_worth.cell_boxes`).
-        lit: (characters, 7) 1 where a segment is lit.
+        width: of a cell.
+        lit: (characters, 7) 1 if a segment is lit.
+
+    Returns: (h, w), one value every STRIDE px.
     """
     rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
     border = int(MARGIN * CELL_PX)
@@ -147,7 +154,7 @@ def cell_scores(sums: Array, squares: Array, boxes: Array, width: float, lit: Ar
             top, left = y - border, x - border
             bottom, right = top + high, left + wide
             energy = squares[bottom, right] - squares[top, right] - squares[bottom, left] + squares[top, left]
-            if energy < least:  # less than a level everywhere
+            if energy < least:  # less than one gray level on average
                 continue
             best = 0.0
             for g in range(lit.shape[0]):
@@ -175,7 +182,7 @@ def _overlap(a: DigitCell, b: DigitCell) -> bool:
 
 
 def _rows(cells: list[DigitCell]) -> list[DigitRow]:
-    """Cells joined into rows from the best on."""
+    """Join neighbouring cells into rows, beginning with the best cell; returns the rows, best first."""
     free = list(cells)
     rows: list[DigitRow] = []
     while free and len(rows) < MOST_ROWS:
@@ -191,6 +198,7 @@ def _rows(cells: list[DigitCell]) -> list[DigitRow]:
 
 
 def _beside(a: DigitCell, b: DigitCell) -> bool:
+    """Return whether two cells may belong to one row."""
     height = max(a.height, b.height)
     gap = max(a.u, b.u) - min(a.u + a.width, b.u + b.width)
     return (
@@ -202,6 +210,7 @@ def _beside(a: DigitCell, b: DigitCell) -> bool:
 
 
 def _row(cells: list[DigitCell]) -> DigitRow:
+    """Return a row with the given cells."""
     weights = np.array([cell.score for cell in cells])
     height = float(np.average([cell.height for cell in cells], weights=weights))
     return DigitRow(

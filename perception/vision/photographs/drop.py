@@ -19,35 +19,36 @@ from perception.vision.image import WHITE_LEVEL, as_gray
 from perception.vision.reading import probability
 from perception.vision.status.pointer import PointerFit, wrapped
 
-FACE = 0.86  # of the radius: where a drop is looked for
-LEAST_SEPARATION = 3.2  # spreads of the face: two halves of one blurred gray lie 2.7 apart
-LEAST_CONTRAST = 12.0
-LEAST_HUB, MOST_HUB = 0.18, 0.46  # of the radius: a drop's hub is wider than any needle's
-NUMERAL = 0.09  # of the radius: wider than the strokes of numerals
-HALO = 0.24  # of the radius: what a saturated spot is widened by
+FACE = 0.86  # of the radius; a drop is searched for inside
+LEAST_SEPARATION = 3.2  # spreads of the face; two halves of one blurred gray are 2.7 apart
+LEAST_CONTRAST = 12.0  # between the face and the brightest or darkest part of a channel
+LEAST_HUB, MOST_HUB = 0.18, 0.46  # of the radius; a drop's hub is wider than that of any needle
+NUMERAL = 0.09  # of the radius; wider than the strokes of numerals
+HALO = 0.24  # of the radius, by which a saturated spot is widened
 
 TURNS = np.deg2rad(np.arange(0.0, 360.0, 2.0))
 NEAR = np.deg2rad(np.arange(-6.0, 6.1, 0.5))
-REACHES = np.arange(0.7, 1.0, 0.05)  # of the radius, where tips may be
-HUBS, FINE_HUBS = (0.8, 1.0), (0.7, 0.8, 0.9, 1.0)  # of the widest place's radius: where the sides touch the hub
-ALONG = np.linspace(0.12, 0.92, 14)  # of a side: where it is looked at
-BESIDE = 0.06  # of the radius, to either side of it
-PEAK = 0.1  # directions whose score is that near to the best tell the axis
-APART_RAD = np.deg2rad(35.0)
+REACHES = np.arange(0.7, 1.0, 0.05)  # of the radius: tried distances of the tip
+# Of the hub's radius: tried distances at which the sides touch the hub.
+HUBS, FINE_HUBS = (0.8, 1.0), (0.7, 0.8, 0.9, 1.0)
+ALONG = np.linspace(0.12, 0.92, 14)  # shares of a side at which it is sampled
+BESIDE = 0.06  # of the radius: distance of the samples on either side of it
+PEAK = 0.1  # directions whose score is this near to the best one determine the axis
+APART_RAD = np.deg2rad(35.0)  # least angle to another direction
 SAME_RAD, NEAR_RAD = (
     np.deg2rad(5.0),
     np.deg2rad(20.0),
-)  # outline and sides agree; a numeral at one side is part of the outline
+)  # largest angles between outline and sides if they agree, and if a numeral on one side is part of the outline
 SIDES_SIGMA_RAD = 0.02
-SCORE, LEAD = (0.5, 0.02), (0.06, 0.02)  # half and scale
-MOST_BY_SIDES = 0.85
-LEAST_LEAD = 0.1  # of sides that are believed against the outline
-DOUBTFUL = 0.45  # confidence where outline and sides point elsewhere
+SCORE, LEAD = (0.5, 0.02), (0.06, 0.02)  # half and scale of the evidence, see `probability`
+MOST_BY_SIDES = 0.85  # largest confidence of a direction from the sides alone
+LEAST_LEAD = 0.1  # of sides that are used although the outline contradicts
+DOUBTFUL = 0.45  # confidence if outline and sides contradict each other
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drop:
-    """A drop and the most confidence that it deserves."""
+    """A drop and the largest confidence that it justifies."""
 
     fit: PointerFit
     most: float
@@ -55,7 +56,7 @@ class Drop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sides:
-    """The direction whose two sides stand out most: how much (0 to 1), and the lead over directions elsewhere."""
+    """The direction whose two sides stand out most, by how much (0 to 1), and the lead over other directions."""
 
     angle_rad: float
     score: float
@@ -64,7 +65,10 @@ class Sides:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ColourPlane:
-    """One channel and polarity of the picture, (H, W), within a dial: `part` is high where a pointer may be."""
+    """One channel and polarity of the picture, (H, W), within a dial: `part` is high where a pointer may be.
+
+    `mask` is where it is above a threshold, `disc` the inside of the dial.
+    """
 
     part: NDArray[np.float32]
     mask: NDArray[np.bool_]
@@ -72,9 +76,9 @@ class ColourPlane:
 
 
 def find_drop(image: Image, u: float, v: float, radius: float) -> tuple[Drop | None, Drop | None]:
-    """The drop that stands out with its whole outline, and the one whose two sides stand out; None for any other pointer.
+    """Return the drop that stands out with its whole outline, and the one whose two sides stand out.
 
-    The axis does not need the dial's middle, so a pointer seen from the side is read right.
+    None if there is none. The axis is found without the dial's middle, so an oblique view does not falsify the reading.
     """
     middle = (u, v)
     planes = list(_planes(image, u, v, radius))
@@ -97,7 +101,11 @@ def find_drop(image: Image, u: float, v: float, radius: float) -> tuple[Drop | N
 
 
 def _agreed(fit: PointerFit, own: Sides | None, others: list[Sides]) -> Drop:
-    """The outline's axis, corrected by nearby sides in any plane, or replaced by its own plane's sides if they contradict it."""
+    """Return the drop with the outline's axis, corrected by the sides.
+
+    Sides in any plane with a similar direction correct it; if those of its own plane contradict it clearly, they
+    replace it.
+    """
     clear = [sides for sides in (own, *others) if sides is not None and sides.score > SCORE[0]]
     near = [sides for sides in clear if _off(sides, fit) < NEAR_RAD]
     if near:
@@ -113,11 +121,12 @@ def _agreed(fit: PointerFit, own: Sides | None, others: list[Sides]) -> Drop:
 
 
 def _off(sides: Sides, fit: PointerFit) -> float:
+    """Return the angle between two directions."""
     return float(abs(wrapped(np.array(sides.angle_rad - fit.angle_rad))))
 
 
 def _fit_of(sides: Sides) -> PointerFit:
-    """A `PointerFit` of which only the direction is known; its confidence comes from the sides."""
+    """Return a `PointerFit` of which only the direction is known; its confidence comes from the sides."""
     return PointerFit(
         angle_rad=sides.angle_rad, sigma_rad=SIDES_SIGMA_RAD, strength=20.0, contrast=20.0, rival_ratio=0.3,
         rival_rad=sides.angle_rad + np.pi, supported=1.0, shown=1.0, is_dark=True, unknown=0.0,
@@ -125,12 +134,15 @@ def _fit_of(sides: Sides) -> PointerFit:
 
 
 def _worth(sides: Sides) -> float:
-    """Confidence of a direction known from its sides alone; never high, because marks on both sides of a needle look alike."""
+    """Return the confidence of a direction from its sides alone.
+
+    It is never high, because marks on both sides of a needle look similar.
+    """
     return MOST_BY_SIDES * probability([(sides.score, *SCORE), (sides.lead, *LEAD)])
 
 
 def _planes(image: Image, u: float, v: float, radius: float) -> Iterator[ColourPlane]:
-    """Lightness and both colour axes, bright and dark, parted into face and what stands out of it."""
+    """Yield lightness and both colour axes, bright and dark, each divided into the face and what stands out of it."""
     planes: list[NDArray[Any]] = [as_gray(image)]
     if image.ndim == 3:
         lab = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2LAB)
@@ -150,7 +162,10 @@ def _planes(image: Image, u: float, v: float, radius: float) -> Iterator[ColourP
 
 
 def _region(plane: ColourPlane, middle: tuple[int, int]) -> tuple[NDArray[np.bool_] | None, float]:
-    """The coloured region about the middle and how many spreads of the face it stands out by; None if it is no pointer."""
+    """Return the region of a plane at the middle, and by how many spreads of the face it stands out.
+
+    None if it is no pointer.
+    """
     disc = plane.disc
     mask = _opened(plane.mask, 3)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
@@ -167,15 +182,16 @@ def _region(plane: ColourPlane, middle: tuple[int, int]) -> tuple[NDArray[np.boo
 
 
 def _opened(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
+    """Return a mask without parts narrower than `size`."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0)
 
 
 def _sides(plane: ColourPlane, mask: NDArray[np.bool_], middle: tuple[float, float], radius: float) -> Sides | None:
-    """The direction in which two edges run from a hub about the middle to a tip; None without such a hub.
+    """Return the direction in which two edges run from a hub at the middle to a tip; None without such a hub.
 
     Args:
-        mask: (H, W) the pointer, perhaps with what touches it.
+        mask: (H, W) the pointer, possibly with things that touch it.
     """
     inner = cv2.distanceTransform(_opened(mask, round(NUMERAL * radius) | 1).astype(np.uint8), cv2.DIST_L2, 5)
     y, x = np.mgrid[: mask.shape[0], : mask.shape[1]]
@@ -202,12 +218,15 @@ def _sides(plane: ColourPlane, mask: NDArray[np.bool_], middle: tuple[float, flo
 def _scores(
     ink: NDArray[np.float32], hub: Array, hub_radius: float, radius: float, turns: Array, hubs: tuple[float, ...]
 ) -> Array:
-    """(turns,) how much more ink is within than beside the sides of the best drop that points there."""
+    """Return for each direction (turns,) how much more ink is inside than outside the sides of the best drop in it.
+
+    `ink`: (H, W) 0 on the face to 1 on the pointer; `hubs`: see `HUBS`.
+    """
     best = np.zeros(len(turns))
     sines, cosines = np.sin(turns)[:, None], np.cos(turns)[:, None]
     for reach in REACHES * radius:
         for share in hubs:
-            sin = share * hub_radius / reach  # of half of the angle at the tip
+            sin = share * hub_radius / reach  # of half the angle at the tip
             cos = np.sqrt(1.0 - sin**2)
             foot = share * hub_radius * np.array([sin, cos])
             up, right = foot[0] + (reach - foot[0]) * ALONG, foot[1] * (1.0 - ALONG)
@@ -221,14 +240,14 @@ def _scores(
                              borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
             inside, outside = seen.reshape(len(turns), 2, 2, -1).mean(axis=3).transpose(1, 0, 2)
             left_right = np.maximum(inside - outside, 0.0)
-            best = np.maximum(best, np.sqrt(left_right[:, 0] * left_right[:, 1]))  # a needle has one side of two
+            best = np.maximum(best, np.sqrt(left_right[:, 0] * left_right[:, 1]))  # small for a needle
     return np.asarray(best)
 
 
 def _axis(
     region: NDArray[np.bool_], middle: tuple[float, float], radius: float, separation: float
 ) -> PointerFit | None:
-    """The axis of a drop: a wide hub about the dial's middle with one tip; None for any other pointer."""
+    """Return the axis of a drop: a wide hub at the dial's middle with one tip; None for any other pointer."""
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
     core = np.argwhere(inner > 0.93 * inner.max())
     hub = core.mean(axis=0)[::-1]
@@ -236,9 +255,9 @@ def _axis(
     away = np.hypot(points[:, 0], points[:, 1])
     hub_radius, reach = float(inner.max()), float(np.percentile(away, 99.7))
     if reach < 1.4 * hub_radius or reach < 0.4 * radius:
-        return None  # a disc points nowhere
+        return None  # a disc has no direction
     if hub_radius < LEAST_HUB * radius or np.hypot(*(hub - middle)) > 0.25 * radius:
-        return None  # a thick place off the middle is a counterweight or a letter
+        return None  # a wide part away from the middle is a counterweight or a letter
     far = points[away > max(1.15 * hub_radius, 0.55 * reach)]
     direction = far.mean(axis=0)
     angle = float(np.arctan2(direction[0], -direction[1]))
@@ -259,20 +278,20 @@ def _axis(
 
 
 def _glare_within(gray: NDArray[Any], region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    """(H, W) spots of glare on a pointer that all but its outline surrounds: they are the pointer, whatever they look like."""
+    """Return a mask (H, W) of glare inside the pointer's outline, which belongs to the pointer."""
     corners = cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32))
     hull = cv2.fillConvexPoly(np.zeros(region.shape, np.uint8), corners, 1) > 0
     count, labels = cv2.connectedComponents((gray >= WHITE_LEVEL).astype(np.uint8))
     beyond = np.unique(labels[~hull])
     inside = [k for k in range(1, count) if k not in beyond]
     thick = float(cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5).max())
-    if not inside or thick < 0.6 * LEAST_HUB * radius:  # a glare beside a needle makes no drop of it
+    if not inside or thick < 0.6 * LEAST_HUB * radius:  # glare beside a needle does not make it a drop
         return np.zeros(region.shape, bool)
     return hull & with_halo(np.isin(labels, inside), radius)
 
 
 def with_halo(spots: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    """(H, W) spots of glare as wide as they change the picture."""
+    """Return the spots (H, W) of glare widened by the halo around them."""
     size = round(HALO * radius) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return np.asarray(cv2.dilate(spots.astype(np.uint8), kernel) > 0)

@@ -1,4 +1,4 @@
-"""Seven-segment displays in photographs: a crop, or a scene in which the display must be found first."""
+"""Reader of seven-segment displays in photographs: a crop, or a scene in which the display is searched for first."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from perception.vision.status.glyphs import lit_segments
 
 DIGIT_WINDOW_PX = 64
 SCENE_PX = 640  # larger sides are reduced to this for the search
-ROWS_TRIED = 4
-ROOM_ABOVE, ROOM_BESIDE = 0.5, 1.6  # round a row's cells, over the digit height
-TURNS = np.tan(np.deg2rad(np.arange(-8.0, 8.1, 1.0)))  # looked for
-RIVAL = 0.3  # how much another text read nearby takes from the confidence
-ROW = 0.35  # of the weight of what a crop says: of rows of digits found in it that say something else
-FEW, FEW_OF_SCENE = 4.0, 5.6  # segments, see `_agreed`: of a scene, four are answered and nine are not sure
-FRAME = 0.08  # of a crop's height that a frame may take
+ROWS_TRIED = 4  # rows of digits that are read
+ROOM_ABOVE, ROOM_BESIDE = 0.5, 1.6  # margins around a row's cells, relative to the digit height
+TURNS = np.tan(np.deg2rad(np.arange(-8.0, 8.1, 1.0)))  # tangents of the tried rotations
+RIVAL = 0.3  # weight of other texts read nearby, which lower the confidence
+ROW = 0.35  # weight, relative to that of a crop's reading, of a row of digits in it with another text
+FEW, FEW_OF_SCENE = 4.0, 5.6  # numbers of segments, see `_agreed`; in scenes fewer segments give less confidence
+FRAME = 0.08  # of a crop's height, which a frame may cover
 
 
 def read_photographed_display(image: NDArray[Any], *, scene: bool, least_confidence: float = ANSWER_AT) -> PatchReading:
-    """Text of the display in a photograph.
+    """Read the display in a photograph.
 
     Args:
         image: gray or RGB uint8.
-        scene: False when the image is cropped to the display.
-        least_confidence: as of `taught.inspect`.
+        scene: False if the image is cropped to the display.
+        least_confidence: as of `inspection.inspect`.
 
     Raises:
         InvalidRequest, NotObservable: bad image.
@@ -47,7 +47,10 @@ def read_photographed_display(image: NDArray[Any], *, scene: bool, least_confide
 
 
 def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, PatchReading]]:
-    """Readings of a window with and without what touches its border, each with the weight of its place."""
+    """Return the readings of a window, with and without the ink that touches its border, and the window's weight.
+
+    `place`: the window, whether its ink is dark (None: unknown), and its weight.
+    """
     window, dark, share = place
     straight = _straight(_scaled(window))
     return [
@@ -58,9 +61,9 @@ def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, PatchRea
 def _with_rows(
     whole: list[tuple[float, PatchReading]], rows: list[tuple[float, PatchReading]]
 ) -> list[tuple[float, PatchReading]]:
-    """The readings of a crop, and those of rows of digits found in it.
+    """Return the readings of a crop, and those of rows of digits found in it.
 
-    A row may lack digits, but has no frame and no words beside it: its reading counts in full where the crop has the
+    A row may lack digits, but has no frame and no words beside it. Its reading gets the full weight if the crop has the
     same text, even as a guess.
     """
     supposed = {said.text for _, answer in whole if (said := answer.guess or answer).text is not None}
@@ -68,13 +71,13 @@ def _with_rows(
 
 
 def _agreed(answers: list[tuple[float, PatchReading]], few: float = FEW) -> PatchReading:
-    """The reading with the most weight, or the likeliest refusal if nothing was read.
+    """Return the reading with the most weight, or the likeliest refusal if nothing was read.
 
-    Rivals, a doubtful place and few segments (any bar resembles a 1) lower its confidence.
+    Its confidence is lower if there are rivals, the place is doubtful, or segments are few (any bar resembles a 1).
 
     Args:
-        answers: with the weight of the place where each was read.
-        few: number of segments that is worth 1 - 1/e.
+        answers: each with the weight of the place where it was read.
+        few: number of segments for which the confidence is limited to 1 - 1/e.
     """
     weighed = [
         (share * answer.confidence * float(np.sqrt(lit_segments(answer.text))), share, answer)
@@ -94,14 +97,14 @@ def _agreed(answers: list[tuple[float, PatchReading]], few: float = FEW) -> Patc
 
 
 def _crops(gray: Image) -> list[tuple[Image, bool | None, float]]:
-    """The whole crop, and the window inside its frame; polarity unknown, weight 1."""
+    """Return the whole crop, and the window inside its frame, with unknown polarity and weight 1."""
     inset = round(FRAME * len(gray))
     inner = gray[inset : gray.shape[0] - inset, inset : gray.shape[1] - inset]
     return [(part, None, 1.0) for part in ((gray, inner) if min(gray.shape) > 4 * inset + 24 else (gray,))]
 
 
 def _rows(gray: Image) -> list[tuple[Image, bool | None, float]]:
-    """The likeliest rows of digits in a scene, with a little room round them, their polarity and weight."""
+    """Return the likeliest rows of digits in a scene, with a margin around them, their polarity and weight."""
     scale = min(1.0, SCENE_PX / max(gray.shape))
     small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
     rows = find_digit_rows(np.asarray(small, np.uint8))[:ROWS_TRIED]
@@ -110,6 +113,7 @@ def _rows(gray: Image) -> list[tuple[Image, bool | None, float]]:
 
 
 def _window(gray: Image, row: DigitRow, scale: float) -> Image:
+    """Return the part of the image around a row that was found in a copy scaled by `scale`."""
     above, beside = ROOM_ABOVE * row.height, ROOM_BESIDE * row.height
     x0, x1 = (max(0, round(x / scale)) for x in (row.left - beside, row.right + beside))
     y0, y1 = (max(0, round(y / scale)) for y in (row.top - above, row.bottom + above))
@@ -117,15 +121,16 @@ def _window(gray: Image, row: DigitRow, scale: float) -> Image:
 
 
 def _scaled(window: Image) -> Image:
+    """Return the window with a height of `DIGIT_WINDOW_PX`."""
     factor = DIGIT_WINDOW_PX / window.shape[0]
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(window, None, fx=factor, fy=factor, interpolation=how), np.uint8)
 
 
 def _straight(window: Image) -> Image:
-    """The window sheared so that the flat edges of the digits and of the frame are level.
+    """Return the window sheared so that the horizontal edges of the digits and of the frame are level.
 
-    The shear approximates a rotation; the reader itself finds the remaining lean of the uprights.
+    The shear approximates a rotation; the reader itself finds the remaining slant of the uprights.
     """
     edges = np.abs(cv2.Sobel(cv2.GaussianBlur(window, (0, 0), 1.0), cv2.CV_32F, 0, 1))
     energies = slant_energies(np.ascontiguousarray(edges.T), TURNS)

@@ -1,4 +1,4 @@
-"""One instrument in a photograph, with nothing taught but its kind and its scale."""
+"""Reader of one instrument in a photograph, if only its kind and its scale are known."""
 
 from __future__ import annotations
 
@@ -28,17 +28,19 @@ def read_photograph(
 
     Args:
         image: (H, W) gray or (H, W, 3) RGB uint8.
-        kind: `gauge`: a pointer over a part of a turn; `dial`: a pointer over a full turn that begins straight up, as in a
+        kind: `gauge`: a pointer over a part of a turn; `dial`: a pointer over a full turn that begins straight up, as
+        in a
             water meter; `display`: seven-segment digits.
         scale: least and greatest value of a gauge's or a dial's scale.
-        ends_rad: a gauge's pointer angles there, clockwise from straight up; None: where its ticks end, and three quarters
-            of a turn where they do not tell.
-        is_scene: the display is somewhere in the picture, not cropped. A pointer's dial must fill it.
-        least_confidence: 0 to 1; less sure readings are refused, with the guess that they would have been.
+        ends_rad: pointer angles of a gauge there, clockwise from straight up. If None, they are the ends of the ticks,
+        or
+            three quarters of a turn if these are not found.
+        is_scene: whether the display is somewhere in the picture, not cropped. The dial of a pointer must fill it.
+        least_confidence: 0 to 1; less certain readings are refused, with a guess.
 
     Raises:
-        InvalidRequest: a scale is missing, or given where there is none; a bad image.
-        NotObservable: the image shows nothing.
+        InvalidRequest: a scale is missing, or given for a kind that has none; a bad image.
+        NotObservable: the image is black or saturated.
     """
     _check(kind, scale=scale, ends_rad=ends_rad, is_scene=is_scene)
     if scale is None:
@@ -52,6 +54,11 @@ def read_photograph(
 def _check(
     kind: PhotographKind, *, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None, is_scene: bool
 ) -> None:
+    """Check that scale, ends and scene suit the kind.
+
+    Raises:
+        InvalidRequest: they do not.
+    """
     if kind == "display":
         if scale is not None or ends_rad is not None:
             raise InvalidRequest("a display has no scale", hint="leave scale and ends out, or say which kind it is")

@@ -1,7 +1,7 @@
-"""Ends of a round gauge's scale, found by its ticks.
+"""Search for the ends of a round gauge's scale by its ticks.
 
-On every ring of the face, ticks are followed as long as they are evenly spaced. The ticks of one scale show on several
-rings, and all of them end at the same two places; numerals, words and shadows do not.
+On every ring of the face, ticks are followed as long as they are evenly spaced. The ticks of one scale are visible on
+several rings, and all of them end at the same two places; numerals, words and shadows do not.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import numpy as np
 from hal.arrays import Array, Image
 
 SAMPLES = 1440  # of a turn
-RINGS = np.linspace(0.45, 1.0, 28)  # share of the radius
-FACE_SAMPLES = 161  # 40 degrees: what a tick is darker or brighter than
+RINGS = np.linspace(0.45, 1.0, 28)  # shares of the radius
+FACE_SAMPLES = 161  # 40 degrees: width of the background with which a tick is compared
 STEPS = (6, 170)  # samples from one tick to the next: 1.5 to 42 degrees
-LEAST_REPEATED = 0.15  # correlation of a ring with itself a step on
-SEARCHED = 0.25  # of a step: seen aslant, ticks do not lie evenly
-LEAST_CONTRAST = 0.35  # of the run's median
-HIDDEN_SAMPLES = 96  # 24 degrees: the pointer or a reflection lies over some ticks, over one at least
+LEAST_REPEATED = 0.15  # correlation of a ring with itself shifted by a step
+SEARCHED = 0.25  # of a step; in an oblique view ticks are not evenly spaced
+LEAST_CONTRAST = 0.35  # of a tick, relative to the run's median
+HIDDEN_SAMPLES = 96  # 24 degrees: the pointer or a reflection may hide so much of the scale, or at least one tick
 LEAST_TICKS = 7
 SPAN_RAD = np.deg2rad([60.0, 330.0])
 SAME_RAD = np.deg2rad(4.0)
-LEAST_RINGS, LEAST_SHARE = 2, 0.4  # that agree, and of all rings' weight
+LEAST_RINGS, LEAST_SHARE = 2, 0.4  # that agree, and their share of the weight of all rings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TickRun:
-    """A run of evenly spaced ticks on a ring: angles of the first and the last (rad, clockwise from up), and their number."""
+    """A run of evenly spaced ticks on a ring: angles of the first and last (rad clockwise from up), number, contrast."""
 
     ends_rad: tuple[float, float]
     ticks: int
@@ -38,12 +38,14 @@ class TickRun:
 
     @property
     def weight(self) -> float:
-        """Weight of its ends in the vote."""
+        """Weight of the run's ends in the vote."""
         return self.ticks * float(np.log1p(self.contrast))
 
 
 def scale_ends(gray: Image, u: float, v: float, radius: float) -> tuple[float, float] | None:
-    """Angles of the first and the last tick, rad clockwise from up, their middle within half a turn; None where rings disagree.
+    """Return the angles of the first and the last tick, rad clockwise from up; None if the rings do not agree.
+
+    The middle of both is within half a turn.
 
     Args:
         gray: (H, W) uint8.
@@ -66,7 +68,10 @@ def scale_ends(gray: Image, u: float, v: float, radius: float) -> tuple[float, f
 
 
 def _rings(gray: Image, u: float, v: float, radius: float) -> list[Array]:
-    """(SAMPLES,) how far each place of a ring stands out of the face beside it, as its ticks do."""
+    """Return for each ring how far its places (SAMPLES,) stand out of the face beside them.
+
+    The sign is such that ticks are positive.
+    """
     turn = np.arange(SAMPLES) * 2 * np.pi / SAMPLES
     x, y = (middle + radius * RINGS[:, None] * way for middle, way in ((u, np.sin(turn)), (v, -np.cos(turn))))
     seen = cv2.remap(np.asarray(gray, np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
@@ -74,12 +79,15 @@ def _rings(gray: Image, u: float, v: float, radius: float) -> list[Array]:
     round_once[[0, -1]] = round_once[[1, -2]]
     fine = cv2.blur(round_once, (3, 2), anchor=(1, 0))
     dark = (cv2.blur(fine, (FACE_SAMPLES, 1)) - fine)[1:-1, FACE_SAMPLES:-FACE_SAMPLES].astype(float)
-    # Ticks are narrower than the gaps between them, whatever their ink: the gaps would put the ends half a step off.
+    # Ticks, dark or bright, are narrower than gaps. If gaps were followed, the ends would be off by half a step.
     return [ring if np.mean(ring**3) > 0.0 else -ring for ring in dark]
 
 
 def _longest(profile: Array) -> TickRun | None:
-    """The run of most weight among those of the two smallest steps at which the profile repeats itself."""
+    """Return the run of most weight at the two smallest steps at which the profile repeats itself.
+
+    None if there is none.
+    """
     spectrum = np.fft.rfft(profile - profile.mean())
     repeated = np.fft.irfft(np.abs(spectrum) ** 2)
     if repeated[0] <= 0.0:
@@ -92,7 +100,7 @@ def _longest(profile: Array) -> TickRun | None:
 
 
 def _follow(profile: Array, step: int) -> TickRun | None:
-    """Follow the ticks both ways from the five clearest ones; None for a run that does not belong to a scale."""
+    """Follow the ticks both ways from the five clearest ones; returns None if the run does not belong to a scale."""
     grid = sum(np.roll(profile, -k * step) - np.roll(profile, -k * step - step // 2) for k in range(-2, 3))
     start, contrast = _tick(profile, int(np.argmax(grid)), step)
     contrasts, ends, most_missing = [contrast], [], max(1, HIDDEN_SAMPLES // step)
@@ -113,7 +121,7 @@ def _follow(profile: Array, step: int) -> TickRun | None:
 
 
 def _tick(profile: Array, near: int, step: int) -> tuple[int, float]:
-    """Position of the tick near a place, and its contrast against the gaps beside it."""
+    """Return the position of the tick near a place, and its contrast to the gaps beside it."""
     reach = max(1, int(SEARCHED * step))
     places = np.arange(near - reach, near + reach + 1)
     at = int(places[np.argmax(profile[places % SAMPLES])])
@@ -122,14 +130,15 @@ def _tick(profile: Array, near: int, step: int) -> tuple[int, float]:
 
 
 def _weight(runs: Sequence[TickRun]) -> float:
+    """Return the weight of several runs."""
     return sum(run.weight for run in runs)
 
 
 def _apart(run: TickRun, ends_rad: tuple[float, float]) -> float:
-    """The larger of the angular distances between the ends."""
+    """Return the larger of the angular distances between the ends."""
     return max(abs(_off(one, other)) for one, other in zip(run.ends_rad, ends_rad, strict=True))
 
 
 def _off(angle_rad: float, other_rad: float) -> float:
-    """Angular difference, wrapped to half a turn either way."""
+    """Return the angular difference, wrapped to half a turn either way."""
     return float((angle_rad - other_rad + np.pi) % (2 * np.pi) - np.pi)

@@ -1,4 +1,4 @@
-"""Bota SensONE over serial: binary frames with CRC and a microsecond clock (the maker's BotaForceTorqueSensorComm)."""
+"""Bota SensONE over serial: binary frames with CRC and a microsecond clock (after Bota's BotaForceTorqueSensorComm)."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Bota(StreamDevice[Wrench]):
     def _command(self, link: Link, text: str, *, attempts: int = ATTEMPTS) -> None:
         """Send a command until `r,0,X,0` appears among the data, where X is the command's letter.
 
-        The maker's own client sends no line end, but other parsers read lines. The variant that worked last is tried
+        The manufacturer's client sends no line end, but other parsers read lines. The variant that worked last is tried
         first.
         """
         refusal = b""

@@ -1,7 +1,7 @@
-"""A folder of depth pictures as a range scanner: what the recorders of RGB-D and ToF cameras write.
+"""Range scanner that plays a folder of depth pictures, as recorders of RGB-D and ToF cameras write them.
 
-`.png` with 16 bits (`unit_m` per count; 0 is no reading), `.npy` and the first array of `.npz` in metres (0: no
-reading).
+The pictures are `.png` with 16 bits (`unit_m` per count), or `.npy` or the first array of `.npz` in metres; 0 means no
+reading.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SUFFIXES = (".png", ".npy", ".npz")
 
 
 class DepthCameraOptions(Strict):
-    """Options of `files:depth`; the lens as the recorder's sheet gives it."""
+    """Options of `files:depth`; the lens is that of the recording camera's data sheet."""
 
     path: Path
     fx: Annotated[float, Field(gt=0)]

@@ -33,7 +33,7 @@ COUNTS_PER_N, COUNTS_PER_NM = 100.0, 1000.0
 WRENCH_REGISTER, FIRMWARE_REGISTER, STREAM_REGISTER = 180, 500, 410
 START_STREAM = 0x0200
 STOP_S, STOP_BURST = 0.6, 50  # FF bytes for about half a second stop a stream
-LISTEN_S = 0.08  # like the maker's code, treats a line silent for this long as having no stream
+LISTEN_S = 0.08  # a line silent for this long has no stream, as in the manufacturer's code
 STREAMING_FRAMES = 2
 ANSWER_S = 0.3
 

@@ -2,7 +2,6 @@
 
 Outputs are coils from 0, inputs discrete inputs from 0; one request reads all inputs, so their values are consistent.
 Devices on the same link share one bus.
-Devices with the same wire share one bus.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class IoOptions(ModbusOptions):
 class LightsOptions(IoOptions):
     """Options of `modbus:lights`: the coil and the feedback input of each light, in the panel's order.
 
-    `channels` names them; without it they bear the names in the cell's panel file.
+    `channels` names them; by default they have the names in the cell's panel file.
     """
 
     channels: tuple[str, ...] | None = None
@@ -72,7 +71,7 @@ class LightsOptions(IoOptions):
 
 
 class TouchOptions(IoOptions):
-    """Options of `modbus:touch`: one input a pad."""
+    """Options of `modbus:touch`: one input per pad."""
 
     channels: tuple[str, ...] = ("left", "right")
     contacts: tuple[Point, ...] = (4, 5)
@@ -227,7 +226,7 @@ class IoSwitch(IoDevice[float]):
         )
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """Return the switching distance while the switch is on (degraded: the surface may be nearer), else an invalid reading."""
+        """Return the switching distance while on (degraded, as the surface may be nearer), else an invalid reading."""
         return self.newest(deadline)
 
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:

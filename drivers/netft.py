@@ -106,7 +106,7 @@ class Netft(StreamDevice[Wrench]):
         return self._may_be_new and sequence == FIRST_SEQUENCE + 1
 
     def release(self) -> None:
-        """Stop the stream, because the sensor would otherwise load the network for ever."""
+        """Stop the stream, because the sensor would otherwise load the network without end."""
         link = self.port.link
         super().release()
         if link is not None:

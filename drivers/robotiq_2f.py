@@ -126,7 +126,7 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
         return self.newest(deadline)
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
-        """Start a motion; return the width of the nearest count."""
+        """Start a motion; return the width of the nearest count, in metres."""
         o = self._options
         require_finite(self.name, width_m, force_n, speed_m_per_s)
         goal = self._count(min(max(width_m, 0.0), o.stroke_m))

@@ -1,6 +1,6 @@
-"""Benewake TFmini-Plus: distance over serial, 100 frames a second (SJ-GU-TFmini-Plus A04, chapters 5 and 7).
+"""Benewake TFmini-Plus: distance over serial, 100 frames per second (SJ-GU-TFmini-Plus A04, chapters 5 and 7).
 
-The frame `59 59 dist16 strength16 temperature16 sum8` has no counter and no clock, so the arrival time stamps it.
+The frame `59 59 dist16 strength16 temperature16 sum8` has no counter and no clock, so it is stamped by its arrival.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _exchange(link: Link, request: bytes, is_answered: Callable[[bytes], bool]) 
 
 
 class EchoOptions(Strict):
-    """Keys of all sensors of the family: what counts as seen."""
+    """Keys of all sensors of the family: limits of echo strength and range for a valid distance."""
 
     min_strength: Annotated[int, Field(ge=0, le=65_535)] = 100
     min_range_m: Annotated[float, Field(ge=0)] = 0.0
@@ -53,7 +53,7 @@ class EchoOptions(Strict):
     sigma_m: Annotated[float, Field(gt=0)] = 0.005
 
     def capabilities(self, rate_hz: float) -> ProximityCapabilities:
-        """Return the capabilities given by the options; the maker's figures hold for large, bright targets."""
+        """Return the capabilities given by the options; the data sheet's figures are for large, bright targets."""
         return ProximityCapabilities(
             min_range_m=self.min_range_m, max_range_m=self.max_range_m, sigma_m=self.sigma_m, rate_hz=rate_hz
         )
@@ -71,7 +71,7 @@ class EchoOptions(Strict):
 class TfminiOptions(SerialOptions, EchoOptions):
     """Options of `serial:tfmini`.
 
-    `unit` is what the sensor is told to send. One that takes no commands at all keeps its factory unit, cm.
+    `unit` is the unit that the sensor is set to. A sensor that accepts no commands keeps its factory unit, cm.
     """
 
     rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
@@ -119,7 +119,7 @@ class Tfmini(StreamDevice[float]):
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Set unit and rate; a sensor that confirms neither unit was last set to cm, which is also its factory unit."""
+        """Set unit and rate; a sensor that confirms neither unit sends cm, its factory unit and the last one tried."""
         self._framer.reset()
         self._times.reset()
         asked = command(GET_VERSION)  # if this very command comes back, the line echoes

@@ -36,7 +36,7 @@ class ModbusTfminiOptions(ModbusOptions, EchoOptions):
 
 
 class CanTfminiOptions(CanOptions, EchoOptions):
-    """Options of `can:tfmini`. The manual leaves the order of bytes open; `id` is the sensor's own."""
+    """Options of `can:tfmini`; `id` is the CAN identifier of the sensor. The manual does not state the byte order."""
 
     bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000] = 250_000
     id: Annotated[int, Field(ge=0, le=0x7FF)] = 3
@@ -123,7 +123,7 @@ class CanTfmini(StreamDevice[float]):
         self._make_codec = codec
         self._codec: CanCodec = codec()
         self._clock = SensorClock()
-        self._times = FrameTimes(period_s=1.0 / options.rate_hz, frame_bytes=0)  # the adapter's line is no bus line
+        self._times = FrameTimes(period_s=1.0 / options.rate_hz, frame_bytes=0)  # the adapter has another byte time
         order = "<" if options.byte_order == "little" else ">"
         self._with_clock, self._without_clock = struct.Struct(order + "HHI"), struct.Struct(order + "HH")
 

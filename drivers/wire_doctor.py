@@ -43,7 +43,7 @@ Connect = Callable[[str, str, dict[str, Any]], Any]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the doctor's report; `hint` says what to do when it is not good."""
+    """One line of the doctor's report; `hint` states the remedy if the finding is not good."""
 
     subject: str
     is_good: bool

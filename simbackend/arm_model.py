@@ -25,9 +25,9 @@ class ArmModel:
 
 
 def t3() -> ArmModel:
-    """Return a T3-726-like arm: 1.04 m from shoulder to flange, spherical wrist, tip at most 1.0 m/s.
+    """Return an arm similar to a T3-726: 1.04 m from shoulder to flange, spherical wrist, tip at most 1.0 m/s.
 
-    Own link lengths.
+    The link lengths are not those of the real arm.
     """
     quarter = math.pi / 2.0
     links = (
@@ -53,7 +53,7 @@ def t3() -> ArmModel:
 
 
 def ur10e() -> ArmModel:
-    """Return a UR10e-like arm: the maker's published DH table; masses and radii are rounded."""
+    """Return an arm similar to a UR10e: its published DH table with rounded masses and radii."""
     quarter = math.pi / 2.0
     links = (
         DhLink(d_m=0.1807, a_m=0.0, alpha_rad=quarter),

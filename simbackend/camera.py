@@ -18,7 +18,7 @@ from simbackend.device import VALID, SimDevice, SimOptions, parse
 
 NEAR_M = 0.02
 RATE_HZ = 20.0
-FOCAL_RATIO = 460.0 / 640.0  # the maker's lens: 70 degrees across
+FOCAL_RATIO = 460.0 / 640.0  # lens of the data sheet: 70 degrees across
 
 
 class CameraOptions(SimOptions):
@@ -96,7 +96,7 @@ class SimCamera(SimDevice[Image]):
 
 
 def nominal_lens(width_px: int, height_px: int) -> CameraIntrinsics:
-    """Return the lens of the maker's data sheet: no distortion, axis through the centre."""
+    """Return the lens of the data sheet: no distortion, axis through the centre."""
     focal_px = FOCAL_RATIO * width_px
     return CameraIntrinsics(
         width_px=width_px,

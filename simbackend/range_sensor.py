@@ -20,10 +20,10 @@ JUMP_M = 0.008  # neighbours further apart than this share a beam
 class RangeOptions(SimOptions):
     """Size, field of view and corruption.
 
-    `model = "polar"` is a line scanner of `width` beams that turns `line_rate_hz` times a second, to be swept by the
+    `model = "polar"` is a line scanner of `width` beams that turns `line_rate_hz` times per second, to be swept by the
     wrist. `sigma_m`: noise at 0.5 m, growing with the square of the distance. `bits` = 8 quantises the range from 0.10
     to 1.50 m to 256 steps as the paper's scanner did. `mixed_ratio` of the pixels at a jump report a depth between the
-    two surfaces, and `loss_ratio` of all pixels see nothing.
+    two surfaces, and `loss_ratio` of all pixels have no value.
     """
 
     model: Literal["pinhole", "polar"] = "pinhole"

@@ -1,4 +1,4 @@
-"""A six-axis arm of CiA-402 drives on CANopen: cyclic synchronous position, everything on SYNC (CiA 301, CiA 402-2).
+"""Six-axis arm of CiA-402 drives on CANopen in cyclic synchronous position mode, timed by SYNC (CiA 301, CiA 402-2).
 
 The owner thread sends all targets and then SYNC at a fixed rate; the drives' states are sampled on that SYNC, which
 gives their time stamp. Each drive monitors the host's heartbeat (1016h): if the host dies, the drives fault and brake
@@ -46,7 +46,7 @@ MOST_KNOWN = 64  # number of SYNCs whose time is kept
 class Cia402Options(CanOptions):
     """Options of `can:cia402`; `host_node` is the id of our own heartbeat.
 
-    The thread that sends the SYNCs asks for `realtime_priority`, 0 for none; a system that refuses makes it no error.
+    The thread that sends the SYNCs requests `realtime_priority`, 0 for none; it is no error if the system refuses.
     """
 
     nodes: tuple[Annotated[int, Field(ge=1, le=126)], ...] = (1, 2, 3, 4, 5, 6)

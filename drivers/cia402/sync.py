@@ -1,4 +1,4 @@
-"""Match PDOs to SYNCs by counting both, because a PDO does not say which SYNC it answers."""
+"""Matches PDOs to SYNCs by counting both, because a PDO does not say which SYNC it answers."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ INSTRUCTION_UNKNOWN = 2
 
 
 class DynamixelOptions(BusOptions):
-    """Options of `serial:dynamixel`; `directions` turns joints round, `zero_counts` is where each joint is at 0 rad."""
+    """Options of `serial:dynamixel`; `directions` inverts joints, `zero_counts` is the count of each joint at 0 rad."""
 
     ids: tuple[Annotated[int, Field(ge=0, le=252)], ...] = (1, 2, 3, 4, 5, 6)
     directions: tuple[Literal[-1, 1], ...] | None = None

@@ -47,8 +47,8 @@ CONNECT_S = 4.0
 
 
 class GripperOptions(BusOptions):
-    """Options of `serial:dynamixel_gripper`; the counts at the ends of the stroke and the force of an ampere are
-    those of the built gripper: measure them."""
+    """Options of `serial:dynamixel_gripper`; measure the counts at the ends of the stroke and the force per ampere on
+    the gripper as built."""
 
     id: Annotated[int, Field(ge=0, le=252)] = 7
     rate_hz: Annotated[float, Field(gt=0, le=200)] = 50.0
@@ -96,10 +96,10 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         return self.newest(deadline)
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
-        """Start a motion; return the width of the nearest count.
+        """Start a motion; return the width of the nearest count, in metres.
 
         Raises:
-            InvalidRequest: not finite. DeviceFault: torque is off.
+            InvalidRequest: a value is not finite. DeviceFault: torque is off.
         """
         require_finite(self.name, width_m, force_n, speed_m_per_s)
         o = self._options

@@ -30,7 +30,7 @@ class LinkOptions(Strict):
 
 
 class KinematicsOptions(Strict):
-    """`kinematics` of an arm's options; the sheet that comes with the arm has it."""
+    """`kinematics` of an arm's options; the values are in the arm's data sheet."""
 
     model: str
     links: tuple[LinkOptions, ...]
@@ -75,7 +75,7 @@ def kinematics_of(c: ArmCapabilities) -> dict[str, Any]:
 
 
 def ur10e() -> KinematicsOptions:
-    """Return the maker's published table of the UR10e, with the default limits and radii rounded up."""
+    """Return the published table of the UR10e, with the default limits and with radii rounded up."""
     quarter = math.pi / 2.0
     rows = (
         (0.1807, 0.0, quarter),

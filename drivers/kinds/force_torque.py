@@ -11,7 +11,7 @@ from hal.strict import Strict
 
 
 class RangeOptions(Strict):
-    """Range and noise by the maker's figures; those of the FT 300-S unless given."""
+    """Range and noise by the data sheet; by default those of the FT 300-S."""
 
     force_range_n: Annotated[float, Field(gt=0)] = 300.0
     torque_range_nm: Annotated[float, Field(gt=0)] = 30.0

@@ -45,7 +45,7 @@ OLD_FIRMWARE = '; the first A1 models know no express scans: set mode = "standar
 class RplidarOptions(SerialOptions):
     """Options of `serial:rplidar`; a turn is sorted into `beams` equal sectors, the nearest measurement of each.
 
-    `express` scans are protected by a check; the first A1 models do not know them.
+    `express` scans are protected by a checksum; the first A1 models do not support them.
     """
 
     mode: Literal["standard", "express"] = "standard"

@@ -1,4 +1,4 @@
-"""CAN frames over an slcan adapter (serial or TCP) or Linux SocketCAN, as a byte link that can be captured and reopened."""
+"""CAN frames over an slcan adapter (serial or TCP) or Linux SocketCAN, as a link that can be captured and reopened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Record the traffic of a link in a file, and replay such a file in place of the link.
+"""Records the traffic of a link in a file, and replays such a file in place of the link.
 
 The file holds one JSON object per line. `{"t": s, "dir": "rx", "hex": "5959.."}` is the result of one read; empty reads
 are recorded too, because drivers react to silence. `"tx"` is one write. `"open"` is an opening of the port, with the

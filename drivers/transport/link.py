@@ -29,7 +29,7 @@ class NoAnswer(WireError):
 
 
 class BadAnswer(WireError):
-    """An answer arrived, but not to what was asked."""
+    """An answer arrived, but not to the request."""
 
 
 class Refused(WireError):

@@ -1,4 +1,4 @@
-"""Create Modbus buses from options: RTU when `port` is a path, TCP when it is a number; one shared bus per link."""
+"""Creates Modbus buses from options: RTU if `port` is a path, TCP if it is a number; one shared bus per link."""
 
 from __future__ import annotations
 

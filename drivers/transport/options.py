@@ -26,7 +26,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class Captured(WireOptions):
-    """Keys of every wired driver: `capture` writes all traffic to a file, `replay` reads one instead of the wire."""
+    """Keys of every driver with a link: `capture` writes all traffic to a file, `replay` reads a file instead."""
 
     capture: Path | None = None
     replay: Path | None = None

@@ -96,7 +96,7 @@ def servo_program(options: UrOptions) -> str:
 
 
 class Ur(StreamDevice[JointState]):
-    """A Universal Robots arm."""
+    """Universal Robots arm."""
 
     kind = DeviceKind.ARM
 

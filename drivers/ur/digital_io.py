@@ -37,14 +37,14 @@ Point = Annotated[int, Field(ge=0, le=63)]
 
 
 class UrIoOptions(rtde.RtdeOptions):
-    """Keys that both share."""
+    """Keys that lights and touch share."""
 
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
 
 
 class UrLightsOptions(UrIoOptions):
-    """Options of `ur:lights`: an output for each light; `feedback` inputs tell whether it burns, where they are wired,
-    else the output's own state is given."""
+    """Options of `ur:lights`: an output for each light, and the `feedback` inputs that report whether it is lit;
+    without them the state of the output is reported."""
 
     owns: ClassVar[tuple[str, ...]] = ("the digital outputs",)
     channels: tuple[str, ...] = ("top_left", "top_right", "bottom_right", "bottom_left")

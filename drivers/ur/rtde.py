@@ -28,7 +28,7 @@ REFUSALS = {"NOT_FOUND": "is not known to this controller", "IN_USE": "is taken 
 
 
 class RtdeOptions(TcpOptions):
-    """Keys of every RTDE client. A controller serves several, but some of its parts have one owner: `owns`."""
+    """Keys of every RTDE client; a controller serves several, but each part that a client `owns` has one owner only."""
 
     owns: ClassVar[tuple[str, ...]] = ()
     port: PortNumber = 30_004

@@ -177,10 +177,14 @@ class Panelwright:
             state_of_app(app).hub.close()
 
         self._server = HttpServer(app, self._listener, on_exit=on_exit)
+        if self._wants_warmth:  # at the same time as the cell's start, which waits for another process
+            from service.warm import load_modules
+
+            load_modules()  # here and not in the thread that warms: no task runs before this returns
         freeze_loaded()
         if self._error is not None:
             self._server.stop()  # the cell failed before there was a server to end
-        if self._wants_warmth:  # at the same time as the cell's start, which waits for another process
+        if self._wants_warmth:
             threading.Thread(target=_warm, name="warm", daemon=True).start()
 
     def _start_service(self) -> None:

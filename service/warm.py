@@ -9,6 +9,7 @@ import hashlib
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -19,34 +20,26 @@ ROOMS = ("fusion", "hal", "manipulation", "perception", "simbackend")
 SURVEY = "survey"
 
 
-def _imports() -> None:
-    # All kernels with which a mission computes, plans and draws.
+def load_modules() -> None:
+    """Import every module with which a mission computes, plans and draws.
+
+    Call it before the threads that compute start. A module with kernels that is imported holds the lock of its import and
+    may wait for the compiler's; a thread that compiles holds the compiler's lock and imports.
+    """
     for name in ("service.operations.mission", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         import_module(name)
+    for stage in OF_SERVICE:
+        _warm_up_of(stage)
 
 
-def _vision() -> None:
-    from perception.vision import warm_up
-
-    warm_up()
-
-
-def _range() -> None:
-    from perception.range import warm_up
-
-    warm_up()
+def _warm_up_of(stage: str) -> Callable[[], None]:
+    """Return the `warm_up` of a stage's face, whose modules are imported with it."""
+    warm_up: Callable[[], None] = import_module(OF_SERVICE[stage]).warm_up
+    return warm_up
 
 
-def _fusion() -> None:
-    from fusion import warm_up
-
-    warm_up()
-
-
-def _planning() -> None:
-    from manipulation import warm_up
-
-    warm_up()
+def _warm_up(stage: str) -> None:
+    _warm_up_of(stage)()
 
 
 def _cell() -> None:
@@ -61,23 +54,25 @@ def _cell() -> None:
         supervisor.close()
 
 
+OF_SERVICE = {
+    "range": "perception.range",
+    "vision": "perception.vision",
+    "fusion": "fusion",
+    "planning": "manipulation",
+}
+"""The stages of the service process and their faces. The cell and world processes load their own kernels when they start."""
 STAGES: Mapping[str, Callable[[], None]] = {
-    "range": _range,
-    "vision": _vision,
-    "fusion": _fusion,
-    "planning": _planning,
+    **{stage: partial(_warm_up, stage) for stage in OF_SERVICE},
     "cell": _cell,
-    "imports": _imports,
+    "imports": load_modules,
 }
 """The stages that can be compiled in parallel, the longest first."""
-OF_SERVICE = ("imports", "range", "vision", "fusion", "planning")
-"""The stages of the service process. The cell and world processes load their own kernels when they start."""
 
 
 def warm() -> None:
-    """Load the kernels of the service process into it, and compile those that are not compiled yet."""
-    for name in OF_SERVICE:
-        STAGES[name]()
+    """Load the kernels of the service process into it, after `load_modules`, and compile those that are not compiled yet."""
+    for stage in OF_SERVICE:
+        STAGES[stage]()
 
 
 def sources() -> list[Path]:

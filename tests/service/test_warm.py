@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from perception.vision import warm as vision
 from perception.vision.photographs.photo_display import read_photographed_display
 from service.warm import STAGES
+
+IMPORTED = """
+import sys
+from service.warm import ROOMS, load_modules, warm
+load_modules()
+before = set(sys.modules)
+warm()
+print([name for name in sorted(set(sys.modules) - before) if name.split(".")[0] in ROOMS])
+"""
+
+
+def test_the_thread_that_loads_kernels_imports_no_module_that_may_hold_some() -> None:
+    found = subprocess.run([sys.executable, "-c", IMPORTED], capture_output=True, text=True, timeout=300, check=False)
+    assert (found.stdout.strip(), found.returncode) == ("[]", 0), found.stderr
 
 
 @pytest.mark.parametrize("stage", ["planning", "vision"])

@@ -22,7 +22,7 @@ from perception.vision.patch import Patch
 from perception.vision.projection import CameraProjection, PanelProjection
 from perception.vision.reading import ANSWER_AT, ObjectReading, PatchReading, answer_at, doubted, refused
 from perception.vision.registration.outline import contour_m
-from perception.vision.registration.register import Registration, register
+from perception.vision.registration.register import ObjectFit, Registration, register
 from perception.vision.status.reader import patch_of, read_patch, reader_of
 
 MIN_SUPPORT = 0.25  # least share of the model's edges that must be found; with less it is another panel or pose
@@ -30,6 +30,8 @@ MIN_EDGE_SHARE = 0.2  # the same for one object
 TELLS = 0.9  # confidence from which a reading proves the object although its outline has the plate's gray
 NO_OUTLINE = "the object's outline is not where it should be: check the panel file, or something covers it"
 MIN_RESOLUTION_PX = 10.0  # smaller objects cannot be read
+NO_EDGES = ObjectFit(shift_px=np.zeros(2), shift_sigma_px=0.7, edge_share=float("nan"))
+"""The fit of an object whose kind has no edges that every state shows."""
 JUMP = 0.25  # largest change since the last reading, relative to the scale, that does not need a confident reading
 JUMP_CONFIDENCE = 0.9  # of a reading after a larger change
 
@@ -118,7 +120,8 @@ def _inspect_one(
 ) -> ObjectReading:
     """Check that one object is present, and read it."""
     view = registration.view
-    shift = registration.shift_px.get(spec.name, np.zeros(2))
+    fit = registration.objects.get(spec.name, NO_EDGES)
+    shift = fit.shift_px
     centre_px = view.project([spec.point_m])[0] + shift
     reading = ObjectReading(
         name=spec.name,
@@ -136,7 +139,7 @@ def _inspect_one(
         return replace(reading, reason="most of the object is outside the image: move the camera")
     if _is_bare(patch, noise):
         return replace(reading, reason="nothing but bare plate where the object should be")
-    is_outlined = not registration.edge_share.get(spec.name, float("nan")) < MIN_EDGE_SHARE
+    is_outlined = not fit.edge_share < MIN_EDGE_SHARE
     if not is_outlined and not reader_of(spec.kind).is_telling:
         return replace(reading, reason=NO_OUTLINE)
     if 2 * max(spec.face.half_width_m, spec.face.half_height_m) * patch.image_px_per_m < MIN_RESOLUTION_PX:
@@ -186,7 +189,7 @@ def _with_place(reading: ObjectReading, registration: Registration, spec: PanelO
         return reading
     point = R.T @ (ray * (normal @ t) / facing - t)
     J = _plate_jacobian(view, spec.point_m)
-    sigma_px = registration.shift_sigma_px.get(spec.name, 0.7)
+    sigma_px = registration.objects.get(spec.name, NO_EDGES).shift_sigma_px
     plate = J @ (np.eye(2) * sigma_px**2) @ J.T
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = plate + np.eye(2) * 1e-12

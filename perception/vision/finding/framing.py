@@ -102,7 +102,7 @@ def _objects_share(gray: Image, view: PanelProjection, panel: Panel) -> float:
 
     NaN, for which all comparisons are false, if no object has edges.
     """
-    shares = np.array(list(register(gray, view, panel).edge_share.values()))
+    shares = np.array([fit.edge_share for fit in register(gray, view, panel).objects.values()])
     shares = shares[np.isfinite(shares)]
     return float(shares.mean()) if len(shares) else float("nan")
 

@@ -47,18 +47,33 @@ class Registration:
         covariance: of its motion parameters.
         support: share of the visible model edges with an image edge within 2 px; NaN if too few are in view.
         rms_px: root mean square offset of these edges.
-        shift_px: per object name, the (2,) local shift in addition to the view; zero if it could not be measured.
-        shift_sigma_px: per object name, the standard deviation of each coordinate of that shift.
-        edge_share: per object name, the share of its own edges found; NaN for kinds without fixed edges.
+        objects: per object name, the fit to its own edges; only for kinds with edges that every state shows.
     """
 
     view: PanelProjection
     covariance: Array
     support: float
     rms_px: float
-    shift_px: dict[str, Array]
-    shift_sigma_px: dict[str, float]
-    edge_share: dict[str, float]
+    objects: dict[str, ObjectFit]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObjectFit:
+    """How far an object's own edges lie from where the registered view has them.
+
+    Attributes:
+        shift_px: (2,) the shift, which the built panel's tolerance holds near zero; zero where it was not measured.
+        shift_sigma_px: one sigma of each of its coordinates.
+        edge_share: share of its edges that were found; NaN where too few are in view.
+        measured_px: (2,) the shift by this image alone; None where it was not measured.
+        covariance_px: (2, 2) of `measured_px`.
+    """
+
+    shift_px: Array
+    shift_sigma_px: float
+    edge_share: float
+    measured_px: Array | None = None
+    covariance_px: Array | None = None
 
 
 def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
@@ -84,15 +99,13 @@ def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
     found = _look(smooth, slope_noise, moved, everything, LAST_LOOK_PX)
     near = found.ok & (np.abs(found.offset_px) <= NEAR_PX)
     built_m = panel.tolerances.position_m
-    local = {name: _local_shift(smooth, slope_noise, moved, edges, built_m) for name, edges in own.items()}
+    local = {name: _object_fit(smooth, slope_noise, moved, edges, built_m) for name, edges in own.items()}
     return Registration(
         view=moved,
         covariance=covariance,
         support=float(near.sum() / found.visible.sum()) if found.visible.sum() >= MIN_VISIBLE else float("nan"),
         rms_px=float(np.sqrt(np.mean(found.offset_px[near] ** 2))) if near.any() else float("nan"),
-        shift_px={name: shift for name, (shift, _, _) in local.items()},
-        shift_sigma_px={name: sigma for name, (_, sigma, _) in local.items()},
-        edge_share={name: share for name, (_, _, share) in local.items()},
+        objects=local,
     )
 
 
@@ -203,10 +216,10 @@ def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
     return out
 
 
-def _local_shift(
+def _object_fit(
     smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, built_m: float
-) -> tuple[Array, float, float]:
-    """Return an object's own shift (2,) in px, its standard deviation, and the share of its edges found near the model.
+) -> ObjectFit:
+    """Fit the own shift of an object to its edges.
 
     `built_m` is the standard deviation of the object's position on the plate. The edges of an object have a common
     error that does not average out, because a cast shadow or a side wall moves all edges of one side.
@@ -217,7 +230,8 @@ def _local_shift(
     found = _look(smooth, slope_noise, view, edges, float(np.clip(1.5 + reach_px, 4.0, 9.0)))
     visible = int(found.visible.sum())
     if found.ok.sum() < 6:
-        return np.zeros(2), prior_px, 0.0 if visible >= 6 else float("nan")
+        share = 0.0 if visible >= 6 else float("nan")
+        return ObjectFit(shift_px=np.zeros(2), shift_sigma_px=prior_px, edge_share=share)
     r = found.offset_px[found.ok]
     # The third unknown is growth: all around the object a bezel or a printed ring may be the stronger edge.
     J = np.column_stack([found.normals_px[found.ok], np.ones(len(r))])
@@ -232,7 +246,13 @@ def _local_shift(
     share = float((np.abs(r - J @ solution) < 1.5).sum() / max(1, visible))
     measured = np.linalg.inv(N)[:2, :2] + np.eye(2) * EDGE_BIAS_SIGMA_PX**2
     gain = np.linalg.inv(np.eye(2) / prior_px**2 + np.linalg.inv(measured))
-    return gain @ np.linalg.solve(measured, solution[:2]), float(np.sqrt(np.trace(gain) / 2)), share
+    return ObjectFit(
+        shift_px=gain @ np.linalg.solve(measured, solution[:2]),
+        shift_sigma_px=float(np.sqrt(np.trace(gain) / 2)),
+        edge_share=share,
+        measured_px=solution[:2],
+        covariance_px=measured,
+    )
 
 
 def _joined(outlines: list[Outline]) -> Outline:

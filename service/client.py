@@ -137,13 +137,13 @@ class Client:
         except httpx2.InvalidURL:
             url = httpx2.URL("")
         if not url.host or url.scheme != "http":
-            raise ConfigError(f"{self.url!r} is no address of a service", hint=f"for example {DEFAULT_URL}")
+            raise ConfigError(f"{self.url!r} is not the address of a service", hint=f"for example {DEFAULT_URL}")
         return url
 
     def _lost(self, error: Exception) -> DeviceUnavailable:
         why = str(error).partition("] ")[2] or str(error) or type(error).__name__  # without the error number
         return DeviceUnavailable(
-            f"no panelwright answers at {self.url}: {why}",
+            f"no panelwright service answers at {self.url}: {why}",
             hint="start one with `panelwright serve`, or name its address with --url",
         )
 
@@ -153,7 +153,7 @@ def _json(data: bytes) -> Any:
         return json.loads(data)
     except ValueError:
         raise ConfigError(
-            "what answers there is no panelwright", hint="`panelwright serve` prints the address of its API"
+            "another program answers there", hint="`panelwright serve` prints the address of its API"
         ) from None
 
 

@@ -194,7 +194,7 @@ class Service:
             return
         if self.supervisor.problem is not None:
             raise self.supervisor.problem
-        raise DeviceUnavailable("the cell is starting", hint="GET /readyz tells when it is up", device="cell")
+        raise DeviceUnavailable("the cell is starting", hint="GET /readyz shows when it is ready", device="cell")
 
     def _check_not_stopped_since(self, count: int) -> None:
         """Raise `Stopped` when the latch's count has risen: a stop that was reset since leaves no other trace."""

@@ -120,7 +120,7 @@ def _faults_of(cell: Cell, name: str, section: DeviceSection) -> Iterator[Fault]
         yield from (fault.below("options") for fault in of_options)
     if section.kind in LOOKING and section.mount is None:
         hint = f'add mount = {{ parent = "flange", calibration = "{name}" }} and that calibration record'
-        yield Fault("mount", f"is missing: nobody knows where the {section.kind} sits", hint)
+        yield Fault("mount", f"is missing, so the pose of the {section.kind} is not known", hint)
 
 
 def _other_driver(section: DeviceSection, is_kind: DeviceKind) -> str:

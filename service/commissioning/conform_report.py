@@ -63,7 +63,7 @@ class Notebook:
             self._levels[item.nodeid] = level = str(mark.args[0]) if mark else order[0]
             if order.index(level) > order.index(self.level):
                 above.append(item)
-                why = f"level {level} was not asked for"
+                why = f"level {level} was not requested"
                 self._note(item.nodeid, "not tried", 0.0, why, "")
         config.hook.pytest_deselected(items=above)
         items[:] = [item for item in items if item not in above]
@@ -80,7 +80,7 @@ class Notebook:
         """Note Ctrl-C, so that the report lists the remaining tests as not tried."""
         self.is_stopped = True
         for node in self._open:
-            self._note(node, "not tried", 0.0, "Ctrl-C came before", "")
+            self._note(node, "not tried", 0.0, "interrupted by Ctrl-C before", "")
 
     def _note(self, node: str, outcome: str, took_s: float, why: str, link: str) -> None:
         self._open = [other for other in self._open if other != node]

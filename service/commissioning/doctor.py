@@ -107,7 +107,7 @@ def _served_cell(port: int) -> str | None:
 
 def _ports(port: int, served: str | None) -> str:
     if served is not None:
-        return f"panelwright serves cell {served} there; it has the devices, so they are not tried"
+        return f"panelwright serves cell {served} there and uses the devices, so they are not tested"
     for number in (port, port + 1):
         bound_socket("127.0.0.1", number).close()
     return f"{port} and {port + 1} are free"

@@ -98,7 +98,7 @@ def read_about(path: Path) -> About:
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}", hint=hint) from error
     except ValueError as error:
-        raise ConfigError(f"{path} is no recording: its first line is no JSON", hint=hint) from error
+        raise ConfigError(f"{path} is not a recording: its first line is not JSON", hint=hint) from error
     try:
         return About(
             device=str(line["device"]),

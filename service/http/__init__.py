@@ -1,1 +1,1 @@
-"""The HTTP front: thin routers over `service.core`. The only place that knows FastAPI."""
+"""The HTTP interface: thin routers over `service.core`. Nothing outside this package uses FastAPI."""

@@ -1,4 +1,4 @@
-"""The application: routers, guard, problems, API document and web page, put together."""
+"""Builds the HTTP application from routers, guard, problem handlers, API document and web page."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from service.readings import ReadingDesk
 
 WEB = Path(__file__).parents[1] / "web"
 DESCRIPTION = f"""
-A robot cell that inspects and works an industrial control panel.
+A robot cell that inspects and operates an industrial control panel.
 
-Long work is a task: the verbs answer 202 with `Location: /v1/tasks/{{id}}`, or 200 when `wait_s` was enough.
+Long work runs as a task: the verbs answer 202 with `Location: /v1/tasks/{{id}}`, or 200 if the task ends within `wait_s`.
 Errors are RFC 9457 problems with `hint` and `retry`. Lengths are metres, angles radians, forces newtons.
 Poses are named `parent_from_child`; covariances are 6x6 over (dx, dy, dz, rx, ry, rz) in the parent's axes.
 
@@ -54,11 +54,11 @@ Poses are named `parent_from_child`; covariances are 6x6 over (dx, dy, dz, rx, r
 
 
 def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
-    """The ASGI application over a service (started or still starting).
+    """Return the ASGI application of a service, which may still be starting.
 
     Args:
-        allowed: hosts and origins that may reach it.
-        stop_url: where the stop process listens, for clients to see.
+        allowed: hosts and origins that may use it.
+        stop_url: address of the stop process, which is shown to clients.
     """
     state = AppState(
         service=service,
@@ -71,7 +71,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         title="panelwright",
         version=own_version(),
         description=DESCRIPTION,
-        docs_url=None,  # their pages load scripts from elsewhere
+        docs_url=None,  # FastAPI's pages load scripts from other hosts
         redoc_url=None,
         dependencies=[Depends(check_query)],
         lifespan=_lifespan,
@@ -102,8 +102,8 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
 
 
 def state_of_app(guarded: ASGIApp) -> AppState:
-    """The state inside an application that `create_app` made."""
-    assert isinstance(guarded, Guard)  # noqa: S101 - only ours come here
+    """Return the state of an application that `create_app` made."""
+    assert isinstance(guarded, Guard)  # noqa: S101 - narrowing: `create_app` returns a Guard
     state: AppState = guarded.inner.state.panelwright
     return state
 
@@ -121,7 +121,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 
 def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
-    """The API document, with the schemas of bodies that strict readers parse."""
+    """Return the API document, with the schemas of the bodies that strict readers parse."""
     if app.openapi_schema:
         return app.openapi_schema
     document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
@@ -147,7 +147,7 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
 
 
 def _drop_unused_validation(document: dict[str, Any]) -> None:
-    """FastAPI documents its own 422 body, which we never send."""
+    """Remove FastAPI's own 422 body from the document, because it is never sent."""
     for path in document["paths"].values():
         for operation in path.values():
             operation.get("responses", {}).pop("422", None)

@@ -1,4 +1,4 @@
-"""Strict bodies: parsed by pydantic's own JSON reader, so that NaN, 1e400, unknown keys and broken text are 4xx."""
+"""Parses bodies strictly with pydantic's JSON reader, so that NaN, 1e400, unknown keys and invalid text are 4xx."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ UNKNOWN_KEY = "extra_forbidden"
 
 
 def strict_body(model: type[B]) -> Callable[[Request], Awaitable[B]]:
-    """A dependency that reads the request's JSON body as `model`; an empty body counts as `{}`."""
+    """Return a dependency that reads the request's JSON body as `model`; an empty body counts as `{}`."""
 
     async def read(request: Request) -> B:
         data = await request.body()
         if data and request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-            # Browsers send other types across origins without asking first.
+            # Browsers send other types across origins without a preflight request.
             raise refuse_body(415, "the body's type is not application/json", hint="Content-Type: application/json")
         return parse(data or b"{}", model)
 
@@ -32,10 +32,10 @@ def strict_body(model: type[B]) -> Callable[[Request], Awaitable[B]]:
 
 
 def parse(data: bytes, model: type[B]) -> B:
-    """`data` as `model`.
+    """Parse `data` as `model`.
 
     Raises:
-        BadBody: says what is wrong and where, without repeating the input.
+        BadBody: names what is wrong and where, without repeating the input.
     """
     try:
         body = model.model_validate_json(data, strict=True)
@@ -48,7 +48,7 @@ def parse(data: bytes, model: type[B]) -> B:
 
 def _refused(error: ValidationError, model: type[BaseModel]) -> BadBody:
     found = error.errors(include_input=False, include_url=False, include_context=False)
-    # A misspelt key leaves its right one missing: the misspelling is what to mend, so it comes first.
+    # A misspelt key is reported first, because it also makes the right key missing.
     items = sorted(found, key=lambda item: item["type"] != UNKNOWN_KEY)[:MAX_FAULTS]
     faults = [FieldFault(path=path_of(("body", *item["loc"])), message=_words(item)) for item in items]
     status = 400 if items[0]["type"] == "json_invalid" else 422
@@ -77,7 +77,7 @@ def _is_finite(value: Any) -> bool:
 def body_schema(
     model: type[BaseModel], example: dict[str, Any] | None = None, *, required: bool = False
 ) -> dict[str, Any]:
-    """`openapi_extra` that documents the body of a route with `strict_body(model)`; `app.openapi` adds the schema."""
+    """Return the `openapi_extra` of a route with `strict_body(model)`; `app.openapi` adds the schema."""
     media: dict[str, Any] = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
     if example is not None:
         media["example"] = example

@@ -1,4 +1,4 @@
-"""`/v1/calibrations`: the records in use, where each comes from and how good it is. `POST` is the verb of that name."""
+"""`/v1/calibrations`: the records in use, with origin and quality. `POST` is the verb of the same name."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ DeviceName = Annotated[str, Path(max_length=64, examples=["wrist_camera"])]
 
 
 class CalibrationView(BaseModel):
-    """The calibration that tasks compute with. `is_measured` False: the cell file's own record."""
+    """A calibration record in use. `is_measured` is false for the cell file's own record."""
 
     device: str
-    parent: Annotated[str, Field(description="frame that the device sits on")]
+    parent: Annotated[str, Field(description="frame that the device is mounted on")]
     is_measured: bool
     version: int
     date: str
@@ -28,21 +28,21 @@ class CalibrationView(BaseModel):
     mount: dict[str, Any] | None
     intrinsics: dict[str, Any] | None
     load: dict[str, Any] | None
-    quality: Annotated[dict[str, float], Field(description="what the method says of itself, SI units")]
-    older: Annotated[list[str], Field(description="records of before, oldest first, kept beside it")]
+    quality: Annotated[dict[str, float], Field(description="quality figures of the method, SI units")]
+    older: Annotated[list[str], Field(description="earlier records, oldest first, which are kept")]
     path: str
     toml: str | None = None
 
 
 class CalibrationList(BaseModel):
-    """One calibration a mounted device."""
+    """The calibrations in use, one per mounted device."""
 
     calibrations: list[CalibrationView]
 
 
 @router.get("", summary="Calibrations in use", operation_id="list_calibrations")
 async def list_calibrations(
-    state: State, toml: Annotated[bool, Query(description="with the text of the records")] = False
+    state: State, toml: Annotated[bool, Query(description="include the text of the records")] = False
 ) -> CalibrationList:
     return CalibrationList(calibrations=await state.in_thread(functools.partial(_all, state, with_text=toml)))
 

@@ -1,4 +1,4 @@
-"""`/v1/lease` and `/v1/stop`: who may move, and the software stop (not a safety function)."""
+"""`/v1/lease` and `/v1/stop`: the right to move the arm, and the software stop (not a safety function)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def release_lease(state: State, lease_token: OwnToken) -> LeaseView:
 
 @router.post(
     "/lease/take-over",
-    summary="Take the lease from its holder; what that one started is stopped",
+    summary="Take the lease from its holder; the tasks of that holder are stopped",
     operation_id="take_over_lease",
     tags=["lease"],
     openapi_extra=HOLDER_SCHEMA,
@@ -61,9 +61,14 @@ async def show_stop(state: State) -> StopView:
     return _stop(state, state.service.supervisor.latch.state())
 
 
-@router.post("/stop", summary="Stop the arm: anybody, any time, no body", operation_id="stop", tags=["stop"])
+@router.post(
+    "/stop", summary="Stop the arm; anybody may do this at any time, without a body", operation_id="stop", tags=["stop"]
+)
 async def stop(state: State, request: Request) -> StopView:
-    """Latches. The same on the port of the stop process (`stop_url`) is faster and works when this service hangs."""
+    """Latch the software stop.
+
+    The same request to the stop process (`stop_url`) is faster, and works even if this service hangs.
+    """
     peer = request.client.host if request.client is not None else "local"
     return _stop(state, await state.act(lambda: state.service.supervisor.stop(f"POST /v1/stop from {peer}")))
 
@@ -83,7 +88,7 @@ async def reset_stop(
     holder = state.service.lease.check(lease_token)
     supervisor = state.service.supervisor
     seen = supervisor.latch.state().count if request.seen_count is None else request.seen_count
-    source = f"POST /v1/stop/reset by {holder or 'nobody in particular'}"
+    source = f"POST /v1/stop/reset by {holder or 'a client without a lease'}"
     return _stop(state, await state.act(functools.partial(supervisor.reset, source, seen_count=seen)))
 
 

@@ -1,4 +1,4 @@
-"""`/v1/devices`: health, newest reading, another driver at run time, and faults for simulated devices."""
+"""`/v1/devices`: health, newest readings, exchange of drivers at run time, and faults of simulated devices."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SECRET = ("password", "token", "key", "secret")
 
 
 class Format(StrEnum):
-    """How a reading is sent."""
+    """Formats of a reading."""
 
     JSON = "json"
     PNG = "png"
@@ -59,7 +59,13 @@ async def read_device(
     name: Name,
     form: Annotated[Format, Query(alias="format")] = Format.JSON,
     max_age_s: Annotated[
-        float, Query(ge=0.0, le=60.0, allow_inf_nan=False, description="a reading so young is not read again")
+        float,
+        Query(
+            ge=0.0,
+            le=60.0,
+            allow_inf_nan=False,
+            description="return the stored reading if it is at most this old, instead of reading again",
+        ),
     ] = 0.0,
 ) -> Response:
     _check(state, name)
@@ -78,7 +84,7 @@ async def read_device(
 
 @router.put(
     "/{name}",
-    summary="Another driver or other options for a device, while the cell runs",
+    summary="Replace a device's driver or options while the cell runs",
     operation_id="swap_device",
     openapi_extra=body_schema(
         SwapRequest, {"driver": "serial:tfmini", "options": {"port": "/dev/serial/by-id/tfmini"}}, required=True
@@ -90,10 +96,10 @@ async def swap_device(
     request: Annotated[SwapRequest, DependsOn(strict_body(SwapRequest))],
     lease_token: LeaseToken = None,
 ) -> DeviceDetail:
-    """The other devices go on. When the new driver does not connect, the old one is kept and the problem says so.
+    """Other devices are not affected. If the new driver does not connect, the old one is kept and the problem says so.
 
-    Refused while a motion runs if the device has a part in motions; after a swap of the arm its drives are off until the
-    next motion. The cell file is not changed: after a restart of the service it holds again.
+    A device that takes part in motions is not replaced while a motion runs. After the arm has been replaced, its drives
+    are off until the next motion. The cell file is not changed and applies again after a restart of the service.
     """
     _check(state, name)
     state.service.lease.check(lease_token)
@@ -102,10 +108,12 @@ async def swap_device(
 
 
 @router.post(
-    "/{name}/connect", summary="Connect a device anew, as it was asked for last", operation_id="connect_device"
+    "/{name}/connect",
+    summary="Connect a device again with its present driver and options",
+    operation_id="connect_device",
 )
 async def connect_device(state: State, name: Name, lease_token: LeaseToken = None) -> DeviceDetail:
-    """For a device that did not connect when the cell started, or whose driver stays down. Refused as a swap is."""
+    """For a device that did not connect at the cell's start, or whose driver has stopped. Refused as `PUT` is."""
     _check(state, name)
     state.service.lease.check(lease_token)
     await state.in_thread(functools.partial(_connect, state, name))
@@ -114,7 +122,7 @@ async def connect_device(state: State, name: Name, lease_token: LeaseToken = Non
 
 @router.post(
     "/{name}/fault",
-    summary="Simulated cells: begin or end a fault in a device",
+    summary="Inject a fault into a simulated device, or end it",
     operation_id="inject_fault",
     openapi_extra=body_schema(FaultRequest, {"fault": "silent", "magnitude": 0.0}),
 )
@@ -130,7 +138,7 @@ async def inject_fault(
 
 
 def _check(state: AppState, name: str) -> None:
-    """Raise `NoSuchDevice`, which is a 404 as for everything else that a path names."""
+    """Raise `NoSuchDevice` (404) unless the cell file has a device of that name."""
     try:
         check_name(state.service.cell, name)
     except InvalidRequest as error:
@@ -141,7 +149,7 @@ def _swap(state: AppState, name: str, request: SwapRequest) -> None:
     section = state.service.cell.file.devices[name]
     if request.kind not in (None, section.kind) or request.mount not in (None, section.mount):
         raise InvalidRequest(
-            f"{name} stays a {section.kind} with its mount", hint="send driver and options alone", device=name
+            f"{name} stays a {section.kind} with its mount", hint="send only driver and options", device=name
         )
     fresh = section.model_copy(update={"driver": request.driver, "options": request.options})
     state.service.swap_device(name, with_recordings(fresh, section, runs_dir=state.service.runs_dir))
@@ -157,7 +165,7 @@ def _inject(service: Service, name: str, request: FaultRequest) -> DeviceView:
     device = service.supervisor.connection.device(name)
     if service.cell.file.cell.mode == "real" or not hasattr(device, "inject_fault"):
         raise Unsupported(
-            f"{name} is not simulated by itself, so faults cannot be injected", hint="use a simulated cell", device=name
+            f"{name} is not a simulated device, so faults cannot be injected", hint="use a simulated cell", device=name
         )
     device.inject_fault(request.fault, magnitude=request.magnitude)
     service.note("fault-injected", {"device": name, "fault": request.fault, "magnitude": request.magnitude})
@@ -176,7 +184,7 @@ def _view(service: Service, name: str) -> DeviceView:
 
 
 def _health(service: Service, name: str) -> HealthView:
-    """A device that cannot be asked is not connected; that is an answer, not an error."""
+    """Return the health of a device; one that does not answer counts as not connected, which is no error here."""
     try:
         return HealthView(**jsonable(service.supervisor.connection.device(name).health()))
     except CellError as error:
@@ -189,7 +197,7 @@ def _detail(service: Service, name: str) -> DeviceDetail:
     try:
         capabilities = jsonable(service.supervisor.connection.device(name).capabilities())
     except CellError:
-        capabilities = None  # the health says why
+        capabilities = None  # the health gives the reason
     return DeviceDetail(
         **_view(service, name).model_dump(),
         capabilities=capabilities,

@@ -1,4 +1,4 @@
-"""`/v1/frames` and `/v1/panel`: what the cell knows."""
+"""`/v1/frames` and `/v1/panel`: the known frames, and the panel file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.http.state import State
 router = APIRouter(prefix="/v1", tags=["knowledge"], responses=RESPONSES)
 
 
-@router.get("/frames", summary="Where things are", operation_id="list_frames")
+@router.get("/frames", summary="Poses of the devices, the flange and the panel", operation_id="list_frames")
 async def list_frames(state: State) -> FrameList:
     return FrameList(frames=await state.in_thread(lambda: _frames(state.service)))
 
@@ -39,7 +39,7 @@ def _frames(service: Service) -> list[FrameView]:
         flange = service.supervisor.connection.mover.state().base_from_flange
         frames.append(_frame("base", "flange", certain(flange), "measured"))
     except CellError:
-        pass  # no arm, or it cannot be read now: then nobody knows where the flange is
+        pass  # without a readable arm the pose of the flange is not known
     panel = service.world.base_from_panel
     if panel is not None:
         frames.append(_frame("base", "panel", panel, "estimated"))

@@ -1,4 +1,4 @@
-"""What a request must pass before any route sees it: known host, own origin, small body."""
+"""Checks every request before any route: known host, own origin, and a body that is not too large."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ SECURITY_HEADERS = [
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Allowed:
-    """Names under which this service is reached.
+    """The names under which this service may be reached.
 
-    `hosts` may stand in the Host header (without port): a page that a stranger's name server points at us is refused.
-    `origins` may write from a browser.
+    Attributes:
+        hosts: names that the Host header may have (without port); this refuses DNS rebinding.
+        origins: web origins that may send writing requests from a browser.
     """
 
     hosts: frozenset[str]
@@ -40,7 +41,7 @@ class Allowed:
 
 
 class Guard:
-    """ASGI middleware around the app."""
+    """ASGI middleware that refuses requests before the application sees them."""
 
     def __init__(self, app: FastAPI, *, allowed: Allowed, count: Callable[[int], None]) -> None:
         self.inner = app
@@ -49,7 +50,7 @@ class Guard:
         self._count = count
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse, or pass on with a counted body and security headers."""
+        """Refuse the request, or pass it on with a limited body, and add security headers to the answer."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -67,7 +68,7 @@ class Guard:
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str, str] | None:
         if _hostname(headers.get("host", "")) not in self._allowed.hosts:
-            return 400, "this service is not known under that Host", "use the address that `panelwright serve` printed"
+            return 400, "this service does not have that Host name", "use the address that `panelwright serve` printed"
         writes = scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS
         if writes and not self._is_own(headers):
             return 403, "requests from other web pages are refused", "use the page of this service, or no browser"
@@ -97,12 +98,12 @@ class Guard:
 
 
 def _most_bytes(scope: Scope) -> int:
-    """How much a request may bring: an image more than anything else."""
+    """Return the largest size of a request's body, which is larger for images."""
     return LARGE_BODIES.get((scope.get("method", ""), scope["path"]), MAX_BODY_BYTES)
 
 
 def _limited(receive: Receive, most_bytes: int) -> Receive:
-    """Count what really arrives: a chunked body announces no length."""
+    """Count the bytes that really arrive, because a chunked body announces no length."""
     total = 0
 
     async def counted() -> Message:

@@ -1,4 +1,4 @@
-"""`/healthz`, `/readyz`, `/metrics`, `/v1/info`: up before the hardware is."""
+"""`/healthz`, `/readyz`, `/metrics` and `/v1/info`, which answer before the hardware is ready."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ router = APIRouter(tags=["health"], responses=RESPONSES)
 SAFETY_NOTE = "The software stop is not a safety function; an external hardware stop is required."
 
 
-@router.get("/healthz", summary="The service answers", operation_id="healthz")
+@router.get("/healthz", summary="Whether the service answers", operation_id="healthz")
 async def healthz() -> HealthzView:
     return HealthzView()
 
 
 @router.get(
     "/readyz",
-    summary="The cell is up",
+    summary="Whether the cell is ready",
     operation_id="readyz",
-    responses={503: {"description": "not yet, or not any more", "model": ReadyView}},
+    responses={503: {"description": "the cell is not ready", "model": ReadyView}},
     response_model=ReadyView,
 )
 async def readyz(state: State) -> JSONResponse:
@@ -67,7 +67,7 @@ async def info(state: State) -> InfoView:
 
 
 def own_version() -> str:
-    """The installed version, or `unknown` in a bare checkout."""
+    """Return the installed version, or `unknown` if the package is not installed."""
     try:
         return version("panelwright")
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Wakes waiting requests when a task changes: from worker threads into the event loop."""
+"""Wakes waiting requests in the event loop when a worker thread changes a task."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class Hub:
         self.is_closing = False
 
     def open(self, tasks: TaskStore) -> None:
-        """Begin; call inside the event loop."""
+        """Subscribe to the tasks; call it inside the event loop."""
         self._loop = asyncio.get_running_loop()
         self._unsubscribe = tasks.subscribe(self._changed)
 
     def close(self) -> None:
-        """Let every stream end; from any thread."""
+        """End every stream; may be called from any thread."""
         self.is_closing = True
         self._unsubscribe()
         self._call(self._wake)
 
     @contextmanager
     def watch(self) -> Iterator[asyncio.Event]:
-        """An event that is set after each change; the watcher clears it before it looks."""
+        """Yield an event that is set after each change; the watcher clears it before it checks the task."""
         event = asyncio.Event()
         self._watchers.add(event)
         try:
@@ -41,7 +41,7 @@ class Hub:
             self._watchers.discard(event)
 
     async def wait_for(self, task: Task, timeout_s: float) -> bool:
-        """Wait until the task has ended, without a thread; tells whether it has."""
+        """Wait until the task has ended, without blocking a thread; returns whether it has."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + timeout_s
         with self.watch() as changed:

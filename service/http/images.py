@@ -1,4 +1,4 @@
-"""`/v1/images`: store an image once, name it in requests."""
+"""`/v1/images`: stores images, which requests then name by their ids."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BODY: dict[str, Any] = {
 
 
 class ImageView(BaseModel):
-    """A stored image. Pixel (0, 0) is the middle of the upper left pixel, of the picture as it is shown."""
+    """A stored image. Pixel (0, 0) is the middle of the upper left pixel, after rotation by the EXIF orientation."""
 
     id: str
     width_px: int
@@ -35,7 +35,7 @@ class ImageView(BaseModel):
 
     @classmethod
     def of(cls, image: StoredImage) -> ImageView:
-        """The view of a stored image."""
+        """Return the view of a stored image."""
         return cls(
             id=image.id,
             width_px=image.width_px,
@@ -53,7 +53,7 @@ class ImageList(BaseModel):
 
 
 def store_of(state: AppState) -> ImageStore:
-    """The images of this service."""
+    """Return the image store of this service."""
     return ImageStore(state.service.runs_dir)
 
 
@@ -65,10 +65,12 @@ async def list_images(state: State) -> ImageList:
 
 @router.post("", status_code=201, summary="Store a PNG, JPEG or BMP", operation_id="store_image", openapi_extra=BODY)
 async def store_image(state: State, request: Request, response: Response) -> ImageView:
-    """The body is the file itself, at most 32 MB and 40 megapixels, 8 bits a channel. The same image has the same id."""
+    """The body is the file itself: at most 32 MB, 40 megapixels, 8 bits per channel. The same image has the same id."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() not in MEDIA.values():
-        # Browsers send other types across origins without asking first.
-        raise refuse_body(415, "the body's type is no image's", hint=f"Content-Type: {' or '.join(MEDIA.values())}")
+        # Browsers send other types across origins without a preflight request.
+        raise refuse_body(
+            415, "the body's type is not an image type", hint=f"Content-Type: {' or '.join(MEDIA.values())}"
+        )
     data = await request.body()
     image = ImageView.of(await state.in_thread(functools.partial(store_of(state).add, data)))
     response.headers["Location"] = image.url

@@ -1,4 +1,4 @@
-"""`/v1/knowledge`: what the system knows of kinds and panels, and how users add to it."""
+"""`/v1/knowledge`: the known kinds and panels, and how users add to them."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ TEACH_EXAMPLE = {**OUTLINE_EXAMPLE, "kind": "mushroom"}
 
 
 class KindView(BaseModel):
-    """A kind of object; `is_taught` False: shipped with the system."""
+    """A kind of object; `is_taught` is false for a shipped kind."""
 
     name: str
     is_taught: bool
     width_m: float
     height_m: float
-    looks: Annotated[int, Field(description="how many examples it was taught by")]
+    looks: Annotated[int, Field(description="number of examples")]
     toml: str | None = None
 
 
 class ObjectView(BaseModel):
-    """An object of a panel that is known."""
+    """An object of a known panel."""
 
     panel: str
     name: str
     kind: str
-    position_m: Annotated[list[float], Field(description="x, y on the plate from its middle, y up")]
+    position_m: Annotated[list[float], Field(description="x, y on the plate, from its middle, y up")]
 
 
 class PanelView(BaseModel):
-    """A panel that is known; `is_taught` False: the one of the cell file."""
+    """A known panel; `is_taught` is false for the panel of the cell file."""
 
     name: str
     is_taught: bool
@@ -66,7 +66,7 @@ class PanelView(BaseModel):
 
 
 class KnowledgeView(BaseModel):
-    """Everything that is known."""
+    """All known kinds, objects and panels."""
 
     kinds: list[KindView]
     objects: list[ObjectView]
@@ -74,7 +74,7 @@ class KnowledgeView(BaseModel):
 
 
 class QuestionView(BaseModel):
-    """A question of the dialogue; `choices` is empty where any text or number will do."""
+    """A question of the dialogue; `choices` is empty if any text or number is a possible answer."""
 
     key: str
     text: str
@@ -83,7 +83,7 @@ class QuestionView(BaseModel):
 
 
 class QuestionList(BaseModel):
-    """What must be known of one clicked object."""
+    """The questions about one clicked object."""
 
     kind: str
     questions: list[QuestionView]
@@ -94,12 +94,12 @@ V = TypeVar("V", KindView, PanelView)
 
 @router.get("", summary="Kinds, objects and panels, with their TOML", operation_id="list_knowledge")
 async def list_knowledge(
-    state: State, toml: Annotated[bool, Query(description="with the text of the files")] = True
+    state: State, toml: Annotated[bool, Query(description="include the text of the files")] = True
 ) -> KnowledgeView:
     return await state.in_thread(functools.partial(_knowledge, state, with_text=toml))
 
 
-@router.get("/questions", summary="What the dialogue asks about a kind", operation_id="list_questions")
+@router.get("/questions", summary="Questions of the dialogue about an object of a kind", operation_id="list_questions")
 async def list_questions(
     kind: Annotated[str, Query(max_length=41, description="kind of the object", examples=["gauge"])],
 ) -> QuestionList:
@@ -111,7 +111,7 @@ async def list_questions(
 
 @router.post(
     "/outline",
-    summary="What is at one to three clicks in a stored image; writes nothing",
+    summary="Find the object at one to three clicks in a stored image; writes nothing",
     operation_id="find_outline",
     openapi_extra=body_schema(OutlineRequest, OUTLINE_EXAMPLE, required=True),
 )
@@ -158,7 +158,7 @@ def _named(known: Sequence[V], name: str) -> V:
     for view in known:
         if view.name == name:
             return view
-    raise NoSuchKnowledge("nothing of that name is known", hint="GET /v1/knowledge lists what is known")
+    raise NoSuchKnowledge("there is no kind or panel of that name", hint="GET /v1/knowledge lists what is known")
 
 
 def _store(state: AppState) -> KnowledgeStore:
@@ -196,7 +196,7 @@ def _knowledge(state: AppState, *, with_text: bool) -> KnowledgeView:
 
 
 def _text_of(panel: Panel) -> str:
-    """The cell's panel as a panel file has it, defaults written out."""
+    """Return the cell's panel as the text of a panel file, including default values."""
     return toml_text(panel.model_dump(mode="json", by_alias=True, exclude_none=True))
 
 

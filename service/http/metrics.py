@@ -1,4 +1,4 @@
-"""Numbers for operators: event-loop lag, tasks, latch, processes. One registry an app."""
+"""Metrics for operators: event-loop lag, tasks, latch and processes; one registry per application."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from service.core import Service
 
 LAG_PROBE_S = 0.02
 LAG_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-KEPT_LAGS = 3000  # a minute
+KEPT_LAGS = 3000  # one minute of samples
 
 
 class Metrics:
-    """Collects; `text` gives the Prometheus exposition."""
+    """Collects the metrics; `text` returns them in Prometheus' text format."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
         self._registry = CollectorRegistry()
         self._lag = Histogram(
             "panelwright_event_loop_lag_seconds",
-            "how much later than asked a timer fires",
+            "delay of timers in the event loop",
             buckets=LAG_BUCKETS,
             registry=self._registry,
         )
@@ -33,7 +33,7 @@ class Metrics:
         self._registry.register(self)
 
     async def probe_lag(self) -> None:
-        """Measure for ever how late timers fire; run as a task of the event loop."""
+        """Measure endlessly how late timers fire; run as a task of the event loop."""
         loop = asyncio.get_running_loop()
         while True:
             due_s = loop.time() + LAG_PROBE_S
@@ -43,20 +43,20 @@ class Metrics:
             self._lag.observe(lag_s)
 
     def count_answer(self, status: int) -> None:
-        """One more answer with this status."""
+        """Count an answer with this status."""
         self._answers[status] += 1
 
     def lag_p99_s(self) -> float:
-        """99th percentile of the lag over the last minute, seconds."""
+        """Return the 99th percentile of the lag over the last minute, s."""
         lags = sorted(self._lags_s)
         return lags[int(0.99 * (len(lags) - 1))] if lags else 0.0
 
     def text(self) -> bytes:
-        """All metrics in Prometheus text format."""
+        """Return all metrics in Prometheus' text format."""
         return bytes(generate_latest(self._registry))
 
     def collect(self) -> Iterator[Metric]:
-        """Called by the registry."""
+        """Yield the metrics; called by the registry."""
         tasks = GaugeMetricFamily("panelwright_tasks", "kept tasks by state", labels=["state"])
         for state, count in Counter(str(task.state) for task in self._service.tasks.all()).items():
             tasks.add_metric([state], count)

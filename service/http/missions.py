@@ -1,4 +1,4 @@
-"""`GET /v1/missions`: reports of finished missions. (Starting one is a verb.)"""
+"""`GET /v1/missions`: reports of finished missions. (The verb of the same name starts one.)"""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ async def list_missions(state: State) -> MissionList:
 
 @router.get(
     "/{mission}/{name}",
-    summary="A file of a mission: report.html, report.json, a picture",
+    summary="A file of a mission: report.html, report.json or a picture",
     operation_id="fetch_mission_file",
     response_class=FileResponse,
     responses={200: {"content": {"application/octet-stream": {}, "text/html": {}, "application/json": {}}}},
@@ -41,8 +41,8 @@ async def fetch_mission_file(
     root = state.service.runs_dir.resolve()
     path = (root / mission / name).resolve() if PLAIN.fullmatch(mission) and PLAIN.fullmatch(name) else None
     if path is None or path.parent.parent != root or not path.is_file():
-        raise NoSuchMission("there is no such file of a mission", hint="GET /v1/missions lists them")
-    # Reports carry their own styles and pictures and run no scripts.
+        raise NoSuchMission("there is no such mission, or it has no such file", hint="GET /v1/missions lists them")
+    # Reports contain their own styles and pictures and run no scripts.
     policy = "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline' 'self'; frame-ancestors 'none'"
     return FileResponse(path, headers={"Content-Security-Policy": policy, "Cache-Control": "no-store"})
 
@@ -56,7 +56,7 @@ def _missions(runs_dir: FilePath) -> list[MissionView]:
 
 
 def _begun(folder: FilePath) -> str:
-    """When the mission began, as its report says: the file's own time changes with a judgement or a copy."""
+    """Return when the mission began, from its report, because the file's time changes with an evaluation or a copy."""
     report = folder / "report.json"
     return _started(report, report.stat().st_mtime_ns)
 
@@ -66,7 +66,7 @@ def _started(report: FilePath, _changed_ns: int) -> str:
     try:
         return str(json.loads(report.read_text(encoding="utf-8"))["started"])
     except (OSError, ValueError, LookupError, TypeError):
-        return ""  # no report of ours, or damaged: the oldest
+        return ""  # a foreign or damaged report sorts as the oldest
 
 
 def _mission(path: FilePath, begun: str) -> MissionView:

@@ -1,4 +1,4 @@
-"""What the API answers with. Lengths in metres, angles in radians, forces in newtons, the unit in the name."""
+"""Models of the API's answers. Lengths are metres, angles radians, forces newtons, and the unit ends the name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 def _printable(text: str) -> str:
     if not text.isprintable():
-        raise ValueError("only printable characters: it is shown and written down")
+        raise ValueError("must have printable characters only, because it is displayed and recorded")
     return text
 
 
@@ -26,7 +26,7 @@ Holder = Annotated[str, Field(min_length=1, max_length=80, examples=["alice@cons
 
 
 class ArtefactView(BaseModel):
-    """A file that a task left."""
+    """A file that a task produced."""
 
     name: str
     media_type: str
@@ -35,7 +35,7 @@ class ArtefactView(BaseModel):
 
 
 class TaskView(BaseModel):
-    """A task. `result` is there when it succeeded, `problem` when it failed or was cancelled."""
+    """A task. It has a `result` when it succeeded, and a `problem` when it failed or was cancelled."""
 
     id: str
     verb: str
@@ -43,7 +43,7 @@ class TaskView(BaseModel):
     fraction: Annotated[float, Field(ge=0, le=1)]
     step: str
     request: dict[str, Any]
-    result: Annotated[Any, Field(description="of the verb's result model, see its POST")] = None
+    result: Annotated[Any, Field(description="result of the verb; its model is documented at the verb's POST")] = None
     problem: dict[str, Any] | None = None
     artefacts: list[ArtefactView] = []
     holder: str | None = None
@@ -55,7 +55,7 @@ class TaskView(BaseModel):
 
     @classmethod
     def of(cls, task: Task) -> TaskView:
-        """The view of a task. What it ended with shows once it has ended, which is once that is on disk."""
+        """Return the view of a task. Result and problem are shown when the task has ended and its end is on disk."""
         state = task.state
         return cls(
             id=task.id,
@@ -85,7 +85,7 @@ class TaskView(BaseModel):
 
 
 def task_view(result: type[BaseModel]) -> type[TaskView]:
-    """The view of a task whose `result` is of this model, for the API document: `PanelPoseTask` for `PanelPoseResult`."""
+    """Return the view of a task with a `result` of this model, such as `PanelPoseTask` for `PanelPoseResult`."""
     name = f"{result.__name__.removesuffix('Result')}Task"
     annotation: Any = result | None
     return create_model(name, __base__=TaskView, __doc__=TaskView.__doc__, result=(annotation, None))
@@ -98,13 +98,13 @@ class TaskList(BaseModel):
 
 
 def event_data(event: TaskEvent) -> dict[str, Any]:
-    """An event as it goes over the wire."""
+    """Return an event as plain JSON values."""
     data: dict[str, Any] = jsonable(event)
     return data
 
 
 class HealthView(BaseModel):
-    """What a device's owner knows about it."""
+    """The state of a device's connection and its counters."""
 
     connected: bool
     quality: str
@@ -133,7 +133,7 @@ class DeviceList(BaseModel):
 
 
 class DeviceDetail(DeviceView):
-    """A device with its capabilities and where it sits."""
+    """A device with its capabilities, mount and options."""
 
     capabilities: dict[str, Any] | None = None
     mount: dict[str, Any] | None = None
@@ -141,12 +141,12 @@ class DeviceDetail(DeviceView):
 
 
 class ReadingView(BaseModel):
-    """A reading with its stamps; age decides whether it is good, not the success of this call."""
+    """A reading with its time stamps; check `quality` and `age_s`, because the call also succeeds for a bad reading."""
 
     device: str
     kind: DeviceKind
     value: Any
-    host_time_s: Annotated[float, Field(description="on the cell's clock")]
+    host_time_s: Annotated[float, Field(description="time of the reading on the cell's clock")]
     device_time_s: float | None
     age_s: float | None
     sequence: int
@@ -155,14 +155,14 @@ class ReadingView(BaseModel):
 
 
 class FaultRequest(Strict):
-    """Begin a fault in a simulated device, or end it with null."""
+    """Inject a fault into a simulated device; null ends it."""
 
     fault: Fault | None = None
     magnitude: Finite = 0.0
 
 
 class SwapRequest(Strict):
-    """Another driver for a device, as its block in a cell file says it; kind and mount stay what they are."""
+    """Another driver or other options for a device, as in its table of a cell file; kind and mount cannot change."""
 
     driver: Annotated[str, Field(pattern=r"^[a-z0-9_.+-]+:[a-z0-9_.+-]+$", max_length=100, examples=["serial:tfmini"])]
     options: Annotated[dict[str, Any], Field(max_length=100)] = {}
@@ -171,7 +171,7 @@ class SwapRequest(Strict):
 
 
 class FrameView(BaseModel):
-    """Pose of `child` in `parent`; covariance over (dx, dy, dz, rx, ry, rz), m and rad, in the parent's axes."""
+    """The pose of `child` in `parent`; covariance over (dx, dy, dz, rx, ry, rz), m and rad, in the parent's axes."""
 
     parent: str
     child: str
@@ -182,19 +182,19 @@ class FrameView(BaseModel):
 
 
 class FrameList(BaseModel):
-    """What the cell knows about where things are."""
+    """All known poses in the cell."""
 
     frames: list[FrameView]
 
 
 class LeaseRequest(Strict):
-    """Who wants the cell."""
+    """The name of the client that wants the lease."""
 
     holder: Holder
 
 
 class LeaseView(BaseModel):
-    """Who may move. `is_held` false: everybody may."""
+    """The state of the lease. While `is_held` is false, everybody may move the arm."""
 
     is_held: bool
     holder: str | None
@@ -204,29 +204,29 @@ class LeaseView(BaseModel):
 
 
 class GrantView(LeaseView):
-    """The lease as its new holder gets it; send `token` as `Lease-Token` and renew it in time."""
+    """A granted lease. Send `token` as `Lease-Token`, and renew the lease within `ttl_s`."""
 
     token: str
 
 
 class StopView(BaseModel):
-    """The software stop. Not a safety function: a hardware stop is required."""
+    """The state of the software stop, which is not a safety function: a hardware stop is required."""
 
     is_latched: bool
-    count: Annotated[int, Field(description="rises with each change")]
+    count: Annotated[int, Field(description="increases with each change")]
     changed_time_s: float
     source: str
-    stop_url: Annotated[str, Field(description="port of the stop process; POST there when every millisecond counts")]
+    stop_url: Annotated[str, Field(description="address of the stop process, which stops fastest")]
 
 
 class ResetRequest(Strict):
-    """Clear the latch. `seen_count`: refuse if somebody stopped after the caller looked."""
+    """Clear the stop. With `seen_count` it is refused if the stop was latched again after that count."""
 
     seen_count: Annotated[int, Field(ge=0, lt=2**63)] | None = None
 
 
 class MissionView(BaseModel):
-    """A finished mission's folder. `started`: when it began (UTC, ISO 8601), as its report says; missions sort by it."""
+    """The files of a finished mission. `started` is when it began (UTC, ISO 8601), from its report."""
 
     name: str
     started: str | None
@@ -260,7 +260,7 @@ class MissingView(BaseModel):
 
 
 class ReadyView(BaseModel):
-    """May work begin, and without which devices?"""
+    """Whether the cell is ready, and which devices are missing."""
 
     is_ready: bool
     missing: list[MissingView]
@@ -274,7 +274,7 @@ class HealthzView(BaseModel):
 
 
 class InfoView(BaseModel):
-    """What this is."""
+    """Name, version and cell of the service."""
 
     name: str
     version: str

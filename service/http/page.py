@@ -1,4 +1,4 @@
-"""The web page, and the answer to what no route takes: 405 where another method would do, else 404."""
+"""Serves the web page, and answers paths without a route: 405 if another method exists, else 404."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ FILE_METHODS = ("GET", "HEAD")
 
 
 class Page(StaticFiles):
-    """Files of the page, mounted below all routes.
+    """The files of the page, mounted after all routes.
 
     Args:
-        folder: with the files.
-        routes: of the app; looked through for those that take the path with another method.
+        folder: the folder with the files.
+        routes: all routes of the application, which are searched for other methods of a path.
     """
 
     def __init__(self, folder: Path, routes: Sequence[BaseRoute]) -> None:
@@ -27,7 +27,7 @@ class Page(StaticFiles):
         self._routes = routes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """A file, or an `HTTPException` that becomes a problem."""
+        """Send a file, or raise an `HTTPException`, which becomes a problem."""
         allowed = self._methods_of_routes(scope)
         if not allowed and scope["method"] not in FILE_METHODS:
             allowed = FILE_METHODS if self._is_file(scope) else ()
@@ -40,7 +40,7 @@ class Page(StaticFiles):
     def _is_file(self, scope: Scope) -> bool:
         try:
             return self.lookup_path(self.get_path(scope))[1] is not None
-        except (OSError, ValueError):  # too long for a name, or with a zero byte
+        except (OSError, ValueError):  # the name is too long or has a zero byte
             return False
 
     def _methods_of_routes(self, scope: Scope) -> tuple[str, ...]:

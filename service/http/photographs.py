@@ -1,4 +1,4 @@
-"""`POST /v1/read-photograph`: one instrument in a stored photograph; nothing moves and nothing is taught."""
+"""`POST /v1/read-photograph`: reads one instrument in a stored photograph; nothing moves."""
 
 from __future__ import annotations
 

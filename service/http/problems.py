@@ -1,4 +1,4 @@
-"""Every error leaves as an RFC 9457 problem, and none repeats what the caller sent."""
+"""Converts every error to an RFC 9457 problem, none of which repeats the caller's input."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ log = logging.getLogger(__name__)
 
 
 class FieldFault(BaseModel):
-    """One thing that is wrong with a request; `path` says where, e.g. `body.actions.0.object`."""
+    """One fault of a request; `path` says where it is, e.g. `body.actions.0.object`."""
 
     path: str
     message: str
 
 
 class Problem(BaseModel):
-    """RFC 9457 problem with what to do about it."""
+    """An RFC 9457 problem with a hint on how to solve it."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -47,18 +47,18 @@ class Problem(BaseModel):
         }
     )
 
-    type: Annotated[str, Field(description="stable name of the kind of problem")]
+    type: Annotated[str, Field(description="stable name of the type of problem")]
     title: str
     status: int
     detail: Annotated[str, Field(description="what happened this time")]
     hint: Annotated[str, Field(description="what to do about it")]
-    retry: Annotated[Retry, Field(description="may the same request be sent again?")]
+    retry: Annotated[Retry, Field(description="whether the same request may be sent again")]
     details: dict[str, Any] = {}
     errors: list[FieldFault] = []
 
 
 class ProblemResponse(Response):
-    """A problem document."""
+    """A response with a problem document."""
 
     media_type = MEDIA
 
@@ -73,7 +73,7 @@ def problem_response(
     faults: list[FieldFault] | None = None,
     headers: dict[str, str] | None = None,
 ) -> ProblemResponse:
-    """A problem that is no `CellError`."""
+    """Return the response for a problem that is not a `CellError`."""
     body = Problem(
         type=f"urn:panelwright:{name}",
         title=name.replace("-", " ").capitalize(),
@@ -87,18 +87,18 @@ def problem_response(
 
 
 def error_response(error: CellError) -> ProblemResponse:
-    """The problem that a `CellError` is."""
+    """Return the response for a `CellError`."""
     headers = {"Retry-After": "1"} if isinstance(error, Busy) or error.retry is Retry.SAFE else None
     return ProblemResponse(json.dumps(problem_of(error)), status_code=status_of(error), headers=headers)
 
 
 def refuse_body(status: int, what: str, *, hint: str, faults: list[FieldFault] | None = None) -> BadBody:
-    """For body readers: an exception that becomes a problem."""
+    """Return an exception that becomes a problem, for body readers."""
     return BadBody(status, what, hint, faults or [])
 
 
 class BadBody(Exception):
-    """The request's body was not understood."""
+    """The request's body is not valid."""
 
     def __init__(self, status: int, what: str, hint: str, faults: list[FieldFault]) -> None:
         super().__init__(what)
@@ -109,11 +109,11 @@ class BadBody(Exception):
 
 
 class BodyTooLarge(Exception):
-    """More bytes arrived than a request may have."""
+    """The request's body has more bytes than allowed."""
 
 
 def install(app: FastAPI, *, paths: Sequence[str]) -> None:
-    """Register the handlers; `paths` are what a mistyped one may have meant."""
+    """Register the handlers; `paths` are all known paths, from which the hint for a mistyped one is chosen."""
 
     @app.exception_handler(CellError)
     async def _cell_error(_request: Request, error: CellError) -> Response:
@@ -126,12 +126,12 @@ def install(app: FastAPI, *, paths: Sequence[str]) -> None:
     @app.exception_handler(BodyTooLarge)
     async def _too_large(_request: Request, _error: BodyTooLarge) -> Response:
         return problem_response(
-            413, "body-too-large", "the body is too big", hint="send less than 1 MB, an image less than 32 MB"
+            413, "body-too-large", "the body is too large", hint="send less than 1 MB, an image less than 32 MB"
         )
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> Response:
-        # pydantic's own text would echo the input, which may be huge or hostile
+        # pydantic's own text would repeat the input, which may be huge or hostile
         faults = [FieldFault(path=path_of(item["loc"]), message=item["msg"]) for item in error.errors()[:20]]
         what = f"{faults[0].path}: {faults[0].message}" if faults else "the request is not valid"
         return problem_response(422, "invalid-request", what, hint="see /openapi.json", faults=faults)
@@ -142,7 +142,10 @@ def install(app: FastAPI, *, paths: Sequence[str]) -> None:
         headers = dict(error.headers) if error.headers else {}
         what, hint = str(error.detail), "see /openapi.json"
         if error.status_code == HTTPStatus.NOT_FOUND:
-            what, hint = "nothing lives at this path", _near(request.url.path, paths) + "/openapi.json lists all paths"
+            what, hint = (
+                "there is nothing at this path",
+                _near(request.url.path, paths) + "/openapi.json lists all paths",
+            )
         elif error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
             what = f"this path takes {headers.get('Allow', 'other methods')} only"
         return problem_response(error.status_code, name, what, hint=hint, headers=headers or None)
@@ -158,18 +161,18 @@ def install(app: FastAPI, *, paths: Sequence[str]) -> None:
     @app.exception_handler(Exception)
     async def _defect(request: Request, error: Exception) -> Response:
         log.error("%s %s failed by a defect", request.method, request.url.path, exc_info=error)
-        what = f"the service failed by a defect: {type(error).__name__}"
+        what = f"the service has a defect: {type(error).__name__}"
         return problem_response(500, "defect", what, hint="the log has more; please report it", retry=Retry.NEVER)
 
 
 def _near(asked: str, paths: Sequence[str]) -> str:
-    """A question for somebody who mistyped a path; never the path itself, which may be hostile."""
+    """Return a question with the nearest known path; it never repeats the request's path, which may be hostile."""
     near = get_close_matches(asked[:100], paths, n=1, cutoff=0.75)
     return f"did you mean {near[0]}? " if near else ""
 
 
 def path_of(location: tuple[int | str, ...]) -> str:
-    """A key path for people; parts that the caller chose are shortened."""
+    """Return a key path for people; parts that the caller chose are shortened."""
     return ".".join(str(part)[:40] for part in location) or "body"
 
 

@@ -1,4 +1,4 @@
-"""Query parameters that a route does not know are refused: if they were ignored, a misspelt one would go unnoticed."""
+"""Refuses query parameters that a route does not have, because a misspelt one would otherwise go unnoticed."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from starlette.requests import HTTPConnection
 from hal.errors import InvalidRequest
 from service.http.problems import path_of
 
-NEVER_REFUSED = ("/v1/stop",)  # a stop works, however it is asked for
+NEVER_REFUSED = ("/v1/stop",)  # a stop works with any parameters
 
 
 def check_query(connection: HTTPConnection) -> None:
-    """A dependency of every route.
+    """Check the query parameters of a request; a dependency of every route.
 
     Raises:
-        InvalidRequest: names the parameter and those that the route knows.
+        InvalidRequest: there is an unknown parameter; the error names it and the parameters of the route.
     """
     route = connection.scope["route"]
     if not isinstance(route, APIRoute) or route.path in NEVER_REFUSED:

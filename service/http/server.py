@@ -1,4 +1,4 @@
-"""Runs the application with uvicorn, in the main thread or beside it, and ends it in bounded time."""
+"""Runs the application with uvicorn, in the main thread or in another one, and ends it in bounded time."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ LOCAL_NAMES = ("127.0.0.1", "localhost", "::1")
 
 
 class _Server(uvicorn.Server):
-    """uvicorn that tells when a signal comes: streams must be told to end, or it would wait for them."""
+    """A uvicorn server that reports signals, because it would wait for open streams unless they are ended."""
 
     def __init__(self, config: uvicorn.Config, on_exit: Callable[[str], None]) -> None:
         super().__init__(config)
         self._on_exit = on_exit
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Called by uvicorn for SIGINT and SIGTERM."""
+        """Handle SIGINT and SIGTERM; called by uvicorn."""
         self._on_exit("Ctrl-C" if sig == 2 else f"signal {sig}")
         super().handle_exit(sig, frame)
 
 
 class HttpServer:
-    """One HTTP server on a bound socket.
+    """An HTTP server on a bound socket.
 
     Args:
-        on_exit: called first when a signal asks for the end (or `stop` does); stops the arm and ends streams.
+        on_exit: called first when a signal or `stop` ends the server; stops the arm and ends the streams.
     """
 
     def __init__(self, app: ASGIApp, listener: socket.socket, *, on_exit: Callable[[str], None]) -> None:
@@ -53,11 +53,11 @@ class HttpServer:
 
     @property
     def is_up(self) -> bool:
-        """Does it answer?"""
+        """Whether the server answers requests."""
         return bool(self._server.started)
 
     def run(self) -> None:
-        """Serve in this (the main) thread until a signal or `stop`."""
+        """Serve in this thread, which must be the main thread, until a signal or `stop`."""
         self._server.run(sockets=[self._listener])
 
     def start(self) -> None:
@@ -69,7 +69,7 @@ class HttpServer:
             pause.wait(0.01)
 
     def stop(self) -> None:
-        """End it; from any thread. A second call does nothing."""
+        """End the server, from any thread; a second call does nothing."""
         if not self._server.should_exit:
             self._on_exit("the server ends")
             self._server.should_exit = True
@@ -78,7 +78,7 @@ class HttpServer:
 
 
 def names_of(host: str, port: int) -> tuple[frozenset[str], frozenset[str]]:
-    """Hosts and origins under which a server on `host` and `port` is reached."""
+    """Return the hosts and origins under which a server on `host` and `port` is reached."""
     hosts = {*LOCAL_NAMES, host.lower()}
     return frozenset(hosts), frozenset(f"http://{_in_url(name)}:{port}" for name in hosts)
 

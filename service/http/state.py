@@ -1,4 +1,4 @@
-"""What the routers share, and how they get at it."""
+"""The state that the routers share, and the dependencies that give them access to it."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ MAX_READING = 40
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class AppState:
-    """The service and what only its front needs.
+    """The service, and the state of its HTTP interface.
 
     Attributes:
-        stop_url: where the stop process listens; shown to clients.
-        pool: threads for device reads; a silent device can fill it, and then further reads are refused.
-        control_pool: threads for stop, cancel, reset and starting tasks, which no device read may hold up.
+        stop_url: address of the stop process; shown to clients.
+        pool: threads for device reads; when silent devices fill it, further reads are refused.
+        control_pool: threads for stop, cancel, reset and starting tasks, which no device read may delay.
     """
 
     service: Service
@@ -44,10 +44,10 @@ class AppState:
     _reading: int = 0
 
     async def in_thread(self, work: Callable[[], T]) -> T:
-        """Run work that asks devices or the disk outside the event loop.
+        """Run work that accesses devices or the disk outside the event loop.
 
         Raises:
-            Busy: too many such calls wait already.
+            Busy: too many such calls are waiting.
         """
         if self._reading >= MAX_READING:
             raise Busy(f"{self._reading} reads wait already", hint="a device may be silent: see GET /v1/devices")
@@ -58,18 +58,18 @@ class AppState:
             self._reading -= 1
 
     async def act(self, work: Callable[[], T]) -> T:
-        """Run work that starts, stops, cancels or resets outside the event loop; no device read holds it up."""
+        """Run work that starts, stops, cancels or resets outside the event loop; no device read delays it."""
         return await asyncio.get_running_loop().run_in_executor(self.control_pool, work)
 
 
 def state_of(request: Request) -> AppState:
-    """The app's state, for routes."""
+    """Return the application's state, for routes."""
     state: AppState = request.app.state.panelwright
     return state
 
 
 def socket_state(socket: WebSocket) -> AppState:
-    """The app's state, for WebSockets."""
+    """Return the application's state, for WebSockets."""
     state: AppState = socket.app.state.panelwright
     return state
 
@@ -78,10 +78,12 @@ State = Annotated[AppState, Depends(state_of)]
 LeaseToken = Annotated[
     str | None,
     Header(
-        alias="Lease-Token", max_length=200, description="token from POST /v1/lease; needed while somebody holds it"
+        alias="Lease-Token", max_length=200, description="token from POST /v1/lease; needed while the lease is held"
     ),
 ]
 IdempotencyKey = Annotated[
     str | None,
-    Header(alias="Idempotency-Key", max_length=200, description="the same key and request give the same task again"),
+    Header(
+        alias="Idempotency-Key", max_length=200, description="the same key with the same request returns the same task"
+    ),
 ]

@@ -1,4 +1,4 @@
-"""`WS /v1/stream`: joints, wrench, contacts and frames many times a second, sampled and encoded once for all."""
+"""`WS /v1/stream`: joints, wrench, contacts and frames many times per second, encoded once for all listeners."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class Sampler:
-    """Reads the state while anybody listens. A slow listener misses samples; it never holds up another."""
+    """Reads the state while there are listeners. A slow listener misses samples but never delays others."""
 
     def __init__(self, state: AppState) -> None:
         self._state = state
@@ -30,7 +30,7 @@ class Sampler:
         self._task: asyncio.Task[None] | None = None
 
     def join(self) -> asyncio.Queue[str]:
-        """A mailbox that holds the newest sample."""
+        """Return a mailbox that holds the newest sample."""
         mailbox: asyncio.Queue[str] = asyncio.Queue(maxsize=1)
         self._listeners.add(mailbox)
         if self._task is None or self._task.done():
@@ -38,7 +38,7 @@ class Sampler:
         return mailbox
 
     def leave(self, mailbox: asyncio.Queue[str]) -> None:
-        """No more samples, please."""
+        """Send no more samples to the mailbox."""
         self._listeners.discard(mailbox)
 
     def __len__(self) -> int:
@@ -58,9 +58,9 @@ class Sampler:
     async def _text(self) -> str:
         try:
             return json.dumps(await self._state.in_thread(self._sample))
-        except CellError as error:  # too many reads wait: say so and go on
+        except CellError as error:  # for example too many waiting reads: report it and continue
             return json.dumps({"problem": error.what})
-        except Exception as error:  # a defect below must not leave all listeners waiting for ever
+        except Exception as error:  # a defect must not leave all listeners waiting endlessly
             log.exception("sampling the state")
             return json.dumps({"problem": f"the state cannot be read: {type(error).__name__}"})
 
@@ -96,7 +96,7 @@ async def stream(socket: WebSocket) -> None:
             await _forward(socket, mailbox)
         await socket.close(1001)
     except (WebSocketDisconnect, RuntimeError):
-        pass  # the listener is gone
+        pass  # the listener has left
     finally:
         sampler.leave(mailbox)
         watch.cancel()
@@ -110,6 +110,6 @@ async def _forward(socket: WebSocket, mailbox: asyncio.Queue[str]) -> None:
 
 
 async def _until_gone(socket: WebSocket) -> None:
-    """Read and drop what a listener says, to notice when it leaves."""
+    """Read and discard the messages of a listener, to notice when it leaves."""
     while (await socket.receive())["type"] != "websocket.disconnect":
         pass

@@ -1,4 +1,4 @@
-"""Files that a swapped device may read: an HTTP client names recordings of one folder, not any file of the machine."""
+"""Restricts the files that a client may name for a device to one folder of recordings."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from hal.registry import device_factory, options_model
 from service.processes.device_slots import WIRE_KEYS
 
 RECORDINGS = "recordings"
-ALWAYS_FILES = {"capture", "replay"}  # in drivers that do not name their options, too
+ALWAYS_FILES = {"capture", "replay"}  # also in drivers that do not declare their options
 
 
 def with_recordings(section: DeviceSection, own: DeviceSection, *, runs_dir: Path) -> DeviceSection:
-    """The section with the paths of its files, each of them below `runs_dir/recordings`.
+    """Return the section with absolute paths of its files, all of which must be below `runs_dir/recordings`.
 
-    What stands so in the cell file (`own`) may stay as it is.
+    An option that has the same value in the cell file (`own`) is allowed.
 
     Raises:
         InvalidRequest: an option names a file elsewhere, or a file to write.
@@ -33,10 +33,10 @@ def with_recordings(section: DeviceSection, own: DeviceSection, *, runs_dir: Pat
 
 
 def _files(driver: str) -> set[str]:
-    """Names of the options that stand for files; wires are none."""
+    """Return the names of the options that are files; ports and addresses are not."""
     try:
         model = options_model(device_factory(driver))
-    except ConfigError:  # connecting says so
+    except ConfigError:  # reported when the device is connected
         return ALWAYS_FILES
     fields = {} if model is None else model.model_fields
     named = {name for name, field in fields.items() if Path in (field.annotation, *get_args(field.annotation))}
@@ -47,10 +47,10 @@ def _inside(key: str, value: str, runs_dir: Path) -> str:
     if key == "capture":
         raise InvalidRequest("captures cannot be started over HTTP", hint="put capture into the cell file")
     folder = (runs_dir / RECORDINGS).resolve()
-    path = (folder / value).resolve()  # links are followed before it is judged
+    path = (folder / value).resolve()  # the check applies to the target of symbolic links
     if not path.is_relative_to(folder):
         raise InvalidRequest(
-            f"options.{key}: over HTTP files are read from {folder} alone",
+            f"options.{key}: over HTTP, files are read only from {folder}",
             hint=f"put the recording there and name it relative to that folder, or put {key} into the cell file",
             folder=str(folder),
         )

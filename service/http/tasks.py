@@ -1,4 +1,4 @@
-"""`/v1/tasks`: watch, cancel, fetch what was left."""
+"""`/v1/tasks`: watches and cancels tasks, and fetches their files."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ async def show_task(state: State, task_id: TaskId, wait_s: Wait = 0.0) -> TaskVi
 
 @router.post("/{task_id}/cancel", summary="Stop the arm, then end the task", operation_id="cancel_task")
 async def cancel_task(state: State, task_id: TaskId, lease_token: LeaseToken = None, wait_s: Wait = 0.0) -> TaskView:
-    """Anybody may cancel: ending a motion is always allowed. Answers with the task as it is after `wait_s`."""
-    del lease_token  # accepted so that clients may send it with everything
-    task = await state.act(functools.partial(state.service.tasks.cancel, task_id, reason="asked for over HTTP"))
+    """Anybody may cancel, because ending a motion is always allowed. Returns the task as it is after `wait_s`."""
+    del lease_token  # accepted, so that clients may send it with every request
+    task = await state.act(functools.partial(state.service.tasks.cancel, task_id, reason="requested over HTTP"))
     if wait_s > 0.0:
         await state.hub.wait_for(task, wait_s)
     return TaskView.of(task)
 
 
 def _watched(state: State, task_id: TaskId) -> Task:
-    """The task, found before the stream begins: what is not there is a 404 and no empty stream."""
+    """Return the task, looked up before the stream begins, so that an unknown id is a 404 and not an empty stream."""
     return state.service.tasks.get(task_id)
 
 
@@ -58,7 +58,7 @@ def _watched(state: State, task_id: TaskId) -> Task:
     summary="Progress as server-sent events; resume with Last-Event-ID",
     operation_id="watch_task",
     response_class=EventSourceResponse,
-    response_description="one event a change: `id` counts up, `event` is state, progress or artefact, `data` is JSON; the "
+    response_description="one event per change: `id` counts up, `event` is state, progress or artefact, `data` is JSON; the "
     "stream ends with the task",
 )
 async def watch_task(
@@ -70,7 +70,7 @@ async def watch_task(
     with state.hub.watch() as changed:
         while True:
             changed.clear()
-            is_over = task.state.is_final or state.hub.is_closing  # looked at before the events, so that none is missed
+            is_over = task.state.is_final or state.hub.is_closing  # read before the events, so that none is missed
             for event in task.events_after(seen):
                 seen = event.sequence
                 yield ServerSentEvent(id=str(seen), event=event.kind, data=event_data(event))
@@ -81,7 +81,7 @@ async def watch_task(
 
 @router.get(
     "/{task_id}/artefacts/{name}",
-    summary="A file that the task left",
+    summary="A file that the task produced",
     operation_id="fetch_artefact",
     response_class=FileResponse,
     responses={200: {"content": {"application/octet-stream": {}}}},

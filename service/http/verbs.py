@@ -1,4 +1,4 @@
-"""`POST /v1/<verb>`: start an operation as a task, and wait for it a little if asked."""
+"""`POST /v1/<verb>`: starts an operation as a task, and waits for its end if requested."""
 
 from __future__ import annotations
 
@@ -17,12 +17,18 @@ from service.operations import Operation
 from service.tasks.model import Task, TaskState
 
 Wait = Annotated[
-    float, Query(ge=0.0, le=30.0, allow_inf_nan=False, description="wait so long for the end before answering")
+    float,
+    Query(
+        ge=0.0,
+        le=30.0,
+        allow_inf_nan=False,
+        description="wait at most this long for the end of the task before answering",
+    ),
 ]
 
 
 def router(operations: dict[str, Operation]) -> APIRouter:
-    """One route an operation."""
+    """Return a router with one route per operation."""
     routes = APIRouter(tags=["verbs"], responses=RESPONSES)
     for operation in operations.values():
         _add(routes, operation)
@@ -58,15 +64,15 @@ def _add(routes: APIRouter, operation: Operation) -> None:
         summary=operation.summary,
         response_model=view,
         responses={
-            200: {"description": "the task has ended in time; `result` holds the answer", "model": view},
-            202: {"description": "the task goes on; `Location` says where to look", "model": view},
+            200: {"description": "the task has ended; `result` holds the answer", "model": view},
+            202: {"description": "the task is still running or queued; `Location` is its address", "model": view},
         },
         openapi_extra=body_schema(operation.request_model, operation.example),
     )
 
 
 def answer(task: Task) -> Response:
-    """200 with the result, 202 while it goes on, and the problem itself when it failed."""
+    """Return 200 with the result, 202 while the task runs, and the problem itself when it failed."""
     location = {"Location": f"/v1/tasks/{task.id}"}
     if task.state is TaskState.SUCCEEDED:
         return JSONResponse(TaskView.of(task).model_dump(mode="json"), 200, headers=location)

@@ -45,7 +45,9 @@ WHERE = Question(key="where", text="Where is it (pixels: x,y of its middle, or o
 MORE = Question(key="more", text="Is there another object?", choices=("no", "yes"), default="no")
 IS_IT = Question(key="outline", text="Is that the object?", choices=("yes", "no"), default="yes")
 PANEL_NAME = Question(key="panel", text="What is the panel called (small letters, digits, underscores)?")
-LIGHTS = Question(key="lights", text="Where are the four border lights (x,y x,y x,y x,y; nothing: I look for them)?")
+LIGHTS = Question(
+    key="lights", text="Where are the four border lights (x,y x,y x,y x,y; an empty answer finds them in the image)?"
+)
 
 
 class Talk(Protocol):
@@ -101,7 +103,7 @@ class Dialogue:
             if lesson.added:
                 self.talk.say(f"wrote {self.store.write_kind(lesson.kind)}")
             else:
-                self.talk.say(f"{kind} looks like that already: nothing was written")
+                self.talk.say(f"this look of {kind} is known already; nothing was written")
             if self._until_good(lambda: self._answer(MORE)) == "no":
                 break
         self.show_found()
@@ -164,20 +166,22 @@ class Dialogue:
     def _lights(self) -> LightsFound:
         found = find_border_lights(self.overview, points_of(self.talk.ask(LIGHTS), least=0))
         if not found.are_seen:
-            self.talk.say("no border lights were seen: their places are a guess, measure them")
+            self.talk.say("no border lights were found: measure their positions, because those in the file are guesses")
         return found
 
     def _name(self, question: Question) -> str:
         name = self._answer(question)
         if name in IS_IT.choices:  # an answer to the previous question, which must not become a kind
-            raise InvalidRequest(f"{name!r} is no answer to what it is called", hint="give a name")
+            raise InvalidRequest(f"{name!r} cannot be a name", hint="give the name of the kind or panel")
         check_name(name)
         return name
 
     def _answer(self, question: Question) -> str:
         given = self.talk.ask(question) or question.default
         if question.choices and given not in question.choices:
-            raise InvalidRequest(f"{given[:40]!r} is no choice", hint=f"one of: {', '.join(question.choices)}")
+            raise InvalidRequest(
+                f"{given[:40]!r} is not one of the choices", hint=f"one of: {', '.join(question.choices)}"
+            )
         return given
 
     def _until_good(self, step: Callable[[], T]) -> T:
@@ -219,10 +223,10 @@ def describe(overview: Overview, example: Example, knowledge: Knowledge) -> str:
     width, height = (1e3 * side for side in example.size_m)
     x, y = overview.in_image(example.centre_m[None])[0]
     taken = likest(overview, example, knowledge)
-    words = "it looks like nothing that I know"
+    words = "no known kind looks like it"
     if taken is not None:
-        doubt = " (but I would not swear to it)" if taken.reason else ""
-        words = f"I take it for: {taken.kind}, confidence {taken.confidence:.2f}{doubt}"
+        doubt = " (not certain)" if taken.reason else ""
+        words = f"recognised as {taken.kind}, confidence {taken.confidence:.2f}{doubt}"
     return f"found a {shape} of {width:.0f} x {height:.0f} mm about {x:.0f},{y:.0f} px; {words}"
 
 

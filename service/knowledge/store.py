@@ -152,7 +152,10 @@ class KnowledgeStore:
         files = {"kinds": self.kinds, "panels": self.panels}[group]()
         file = next((file for file in files if file.name == name and file.is_taught), None)
         if file is None:
-            raise NoSuchKnowledge("nobody taught that", hint="what is shipped cannot be deleted; teach it anew instead")
+            raise NoSuchKnowledge(
+                "no taught kind or panel has that name",
+                hint="a shipped kind cannot be deleted; teach it again to replace it",
+            )
         file.path.unlink(missing_ok=True)
 
 

@@ -31,7 +31,7 @@ Answer = Annotated[str, Field(max_length=400)]
 
 
 class OutlineRequest(Strict):
-    """What is at these clicks? The middle; two opposite corners; or both."""
+    """Clicks on one object: its middle, two opposite corners, or two corners and the middle."""
 
     image: ImageId
     plate_m: Annotated[PlateSize, Field(description="width and height of the panel's plate")]
@@ -39,7 +39,7 @@ class OutlineRequest(Strict):
 
 
 class ObjectLesson(Strict):
-    """One object of a new panel: what was clicked on, and the answers to GET /v1/knowledge/questions."""
+    """One object of a new panel: its clicks, and the answers to GET /v1/knowledge/questions."""
 
     kind: ObjectName
     name: PlainName
@@ -48,7 +48,7 @@ class ObjectLesson(Strict):
 
 
 class PanelLesson(Strict):
-    """A whole new panel. Without `lights_px` the four border lights are looked for in the corners."""
+    """A whole new panel. Without `lights_px` the four border lights are searched for in the corners."""
 
     name: PlainName
     objects: Annotated[tuple[ObjectLesson, ...], Field(min_length=1, max_length=100)]
@@ -62,7 +62,7 @@ class TeachRequest(Strict):
     plate_m: Annotated[PlateSize, Field(description="width and height of the panel's plate")]
     kind: Annotated[PlainName | None, Field(description="a new name makes a new kind")] = None
     clicks_px: Annotated[tuple[Click, ...], Field(max_length=3)] = ()
-    size_m: Annotated[PlateSize | None, Field(description="of the kind; else that of the outline")] = None
+    size_m: Annotated[PlateSize | None, Field(description="size of the kind; if null, the size of the outline")] = None
     panel: PanelLesson | None = None
 
     @model_validator(mode="after")
@@ -77,7 +77,7 @@ class TeachRequest(Strict):
 
 
 class OutlineView(Result):
-    """What was found at the clicks, and what it is taken for now."""
+    """The outline found at the clicks, and the kind that it is recognised as."""
 
     shape: str
     outline_px: Rows
@@ -90,7 +90,7 @@ class OutlineView(Result):
 
 
 class TaughtView(Result):
-    """What was written. `added` False: the look was known already and nothing was written."""
+    """What was stored. `added` is false if the look was known already and nothing was written."""
 
     what: Literal["kind", "panel"]
     name: str
@@ -234,7 +234,7 @@ def described(overview: Overview, example: Example, store: KnowledgeStore) -> Ou
     from perception.vision.teaching import likest
 
     if example.outline is None:
-        raise InvalidRequest("nothing was pointed at", hint="click on an object")
+        raise InvalidRequest("there are no clicks", hint="click on an object")
     taken = likest(overview, example, store.knowledge())
     return OutlineView(
         shape=example.outline.shape,

@@ -264,4 +264,4 @@ def _refuse_frozen_lines(name: str, scans: Sequence[Stamped[RangeImage]]) -> Non
 
 
 def _rate_hint(c: RangeScannerCapabilities) -> str:
-    return f"it should give {c.rate_hz:.0f} lines a second: look at GET /v1/devices, and that it looks at the panel"
+    return f"it should give {c.rate_hz:.0f} lines per second: see GET /v1/devices, and check that it faces the panel"

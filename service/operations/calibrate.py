@@ -43,13 +43,13 @@ def run_calibrations(session: Session, request: CalibrationRequest) -> Calibrati
         stations = _planned(session, request, device)
         return CalibrationResult(what=request.what, device=device, dry_run=True, stations=stations)
     found = _measure(session, request, device)
-    session.progress(0.95, "keep the record")
+    session.progress(0.95, "store the record")
     current = session.cell.calibration_of(device)
     record = renewed(current, record_of(device, found, date=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())))
     path = Calibrations.of_runs(session.context.runs_dir, session.cell).write(record)
     if request.what != "tool":
         session.world.forget_panel()  # its pose was measured through the previous mount
-    session.progress(0.97, "back to the parking place")
+    session.progress(0.97, "return to the parking position")
     park(session)
     return CalibrationResult(
         what=request.what,
@@ -75,7 +75,7 @@ def _device(session: Session, request: CalibrationRequest) -> str:
     mount = session.cell.file.devices[device].mount
     if mount is None or mount.parent != "flange" or not session.has_mount(device):
         raise Unsupported(
-            f"{device} does not sit on the flange as far as the cell file says, so moving the hand tells nothing of it",
+            f"{device} is not mounted on the flange according to the cell file, so moving the hand does not calibrate it",
             hint='give it mount = { parent = "flange", calibration = ... } and a record with a rough [mount]',
         )
     return device

@@ -70,7 +70,7 @@ def measure_camera(session: Session, camera: str, count: int, known: Beforehand)
         Unreachable: there are too few stations.
         NotObservable: the mount remains too uncertain, or the measurements scatter too much.
     """
-    session.progress(0.08, "choose the stations that tell most")
+    session.progress(0.08, "choose the most informative stations")
     flanges = camera_stations(session, camera, count, known)
 
     def measure() -> InHandView:

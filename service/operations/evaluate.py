@@ -40,7 +40,7 @@ def evaluate(connection: CellConnection, folder: Path) -> EvaluateResult:
         if report[key] != value:
             raise InvalidRequest(
                 f"mission {folder.name!r} was of {key} {report[key]!r}, this service runs {key} {value!r}",
-                hint="judge a mission in the service that ran it: the simulator of another one knows nothing of it",
+                hint="judge a mission in the service that ran it, because only its simulator has the truth",
             )
     began_s = report.get("started_cell_s", -np.inf)  # reports of older versions do not have this key
     verdict = compare(report, truth_of(connection, connection.clock.now_s() - began_s), connection.cell.panel)

@@ -175,7 +175,7 @@ def _told(looks: Sequence[ObjectReading]) -> ObjectReading:
     told = merge_views(looks)
     if told.answered or len(looks) == 1:
         return told
-    return replace(told, reason=f"{told.reason} ({len(looks) - 1} looks from the sides did not tell either)")
+    return replace(told, reason=f"{told.reason} ({len(looks) - 1} views from the sides did not help)")
 
 
 def reading_result(reading: ObjectReading, when: str) -> ReadingResult:
@@ -242,7 +242,7 @@ def need_all_present(found: Inspection, session: Session) -> None:
     lost = missing(found.readings.values(), session.panel.objects)
     if lost:
         raise NotFound(
-            f"{', '.join(lost)} {'is' if len(lost) == 1 else 'are'} not where panel {session.panel.name!r} has it",
+            f"{', '.join(lost)} {'is' if len(lost) == 1 else 'are'} not where the file of panel {session.panel.name!r} says",
             hint="is this the right panel file? is something in the way? see the annotated picture",
             objects=list(lost),
         )

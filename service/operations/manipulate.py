@@ -75,7 +75,7 @@ def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
     goal = panel_object.goal
     if goal is None or not has_part(SKILLS, panel_object.kind):
         raise InvalidRequest(
-            f"{panel_object.name} is a {panel_object.kind}, which cannot be worked: it is read only",
+            f"{panel_object.name} is a {panel_object.kind}, which cannot be operated: it is read only",
             hint=f"kinds that can be: {', '.join(registered(SKILLS))}",
         )
     for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # refused, because its meaning would be a guess

@@ -107,7 +107,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
     with _step(session, "lights", 0.06, 0.10) as part:
         first = locate(part)
     with _step(session, "square view", 0.10, 0.16) as part:
-        part.progress(0.0, "look squarely")
+        part.progress(0.0, "drive to the square view")
         go_to_overview(part)
         located = locate(part)
         _note_lights(session, record, located)
@@ -137,7 +137,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         record.by_lights = estimated(located.base_from_panel)
         record.pictures.append(_drawing(session, located))
     with _step(session, "check by surfaces", 0.57, 0.58) as part:
-        part.progress(0.0, "mushroom and wheel where layout and vision have them?")
+        part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
         checks, pictures = check_surfaces(part, by_surfaces)
         record.by_surfaces = checks
         record.pictures += pictures

@@ -183,7 +183,7 @@ def need_its_place(checks: Iterable[SurfaceCheck], name: str) -> None:
     for check in checks:
         if check.name == name and check.stands_elsewhere:
             raise NotFound(
-                f"{name} is not worked: {check.finding}",
+                f"{name} is not operated: {check.finding}",
                 hint="correct its position_m in the panel file, or measure the scanner's mount (`panelwright calibrate scanner`)",
             )
 
@@ -237,5 +237,5 @@ def _look_closer(session: Session, panel_object: PanelObject) -> SurfaceView | s
 
 def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
     marks = [mark_of(s, view.scan, session.believed_panel()) for s in view.sightings]
-    title = f"surfaces in the range image from {view.place}, and what the panel file has of them"
+    title = f"surfaces in the range image from {view.place}, and the objects of the panel file in it"
     return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))

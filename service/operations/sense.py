@@ -129,7 +129,7 @@ def follow(session: Session, plan: TouchPlan, touches: int) -> Felt:
     accounts: list[TouchResult] = []
     skipped: list[str] = []
     monitor = plausibility.ProximityMonitor(session.panel)
-    ended = "as many places as asked for"
+    ended = "the requested number of places was touched"
     while len(accounts) < touches:
         choice = plan.choice()
         if reason := plan.reason_to_stop(choice):

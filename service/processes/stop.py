@@ -62,7 +62,7 @@ class StopServer:
         headers = {key.strip().lower(): value.strip() for key, _, value in (line.partition(":") for line in lines[1:])}
         origin = headers.get("origin", "")
         if path != "/v1/stop":
-            return self._response(404, {"title": "only /v1/stop lives here", "hint": "use the main port"}, origin)
+            return self._response(404, {"title": "this port serves only /v1/stop", "hint": "use the main port"}, origin)
         if method == "POST":
             state = self._latch.set(f"POST /v1/stop from {peer}")
             return self._response(200, as_dict(state), origin)
@@ -70,7 +70,11 @@ class StopServer:
             return self._response(200, as_dict(self._latch.state()), origin)
         if method == "OPTIONS":
             return self._response(204, None, origin)
-        return self._response(405, {"title": f"{method[:16]} is not allowed", "hint": "POST stops, GET tells"}, origin)
+        return self._response(
+            405,
+            {"title": f"{method[:16]} is not allowed", "hint": "POST latches the stop, GET returns its state"},
+            origin,
+        )
 
     def _response(self, status: int, body: object, origin: str) -> bytes:
         data = b"" if body is None else json.dumps(body).encode()

@@ -272,7 +272,7 @@ class Supervisor:
         def on_exit(code: int) -> None:
             if not errors:
                 text = f"the cell process ended with code {code}"
-                errors.append(DeviceUnavailable(text, hint="its last words are in the log above", device="cell"))
+                errors.append(DeviceUnavailable(text, hint="see its last messages in the log above", device="cell"))
             answered.set()
 
         self._missing.clear()
@@ -332,7 +332,7 @@ class Supervisor:
                 continue
             self._bury(child)
             if self._restarts >= MAX_RESTARTS:
-                log.error("the cell died %d times and stays down", self._restarts + 1)
+                log.error("the cell died %d times and is not restarted", self._restarts + 1)
                 return
             self._restarts += 1
             with contextlib.suppress(CellError):

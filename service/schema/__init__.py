@@ -1,1 +1,1 @@
-"""What the verbs take and what they answer: strict models with units in the names, which the API document shows."""
+"""Models of the verbs' requests and answers, strict and with units in the names; the API document shows them."""

@@ -1,4 +1,4 @@
-"""Bodies of the verb `fuse` for the schema: nine kinds of sensing, and an object whose own measures are unknown."""
+"""Example bodies of the verb `fuse`: the nine kinds of sensing, and an object with unknown dimensions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import JsonValue
 
-_MM2, _TILT = 1e-6, 1e6  # 1 mm as a variance, 1 mrad as an information
+_MM2, _TILT = 1e-6, 1e6  # the variance of 1 mm, and the information of 1 mrad
 
 
 def _diagonal(x: float, y: float, z: float) -> list[list[float]]:

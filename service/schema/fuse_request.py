@@ -1,6 +1,6 @@
-"""The body of `fuse`: measurements of nine kinds, and objects whose own measures are unknown.
+"""The body of `fuse`: measurements of nine kinds, and objects with unknown dimensions.
 
-Each body turns itself into what `fusion` takes, which is imported only then: the service is up fast.
+Each model converts itself to the types of `fusion`, which is imported only then, so that the service starts fast.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SENSING = Literal[
 class MeasurementBody(Strict):
     """One sensing of one object feature (paper, section IV): `g(y, v) = (y - mu)^T C^-1 (y - mu) + v^T M v`."""
 
-    sensing: Annotated[SENSING, Field(description="sensor feature, then object feature")]
+    sensing: Annotated[SENSING, Field(description="kind of the sensed feature, then of the object feature")]
     x_m: Annotated[Point, Field(description="point of the object feature, object frame")]
     u: Annotated[Vector3, Field(description="unit direction or normal of the object feature")] = (0.0, 0.0, 1.0)
     mu_m: Annotated[Point, Field(description="sensed point, or a point of the sensed line or plane, base frame")]
@@ -39,11 +39,11 @@ class MeasurementBody(Strict):
     label: Annotated[str, Field(max_length=80)] = ""
     sensor: Annotated[str, Field(max_length=80)] = ""
     part: Annotated[
-        str, Field(max_length=41, description="part of `shape` that was sensed; then x_m and u are ignored")
+        str, Field(max_length=41, description="part of `shape` that was sensed; if given, x_m and u are ignored")
     ] = ""
 
     def measurement(self) -> Measurement:
-        """The same as fusion takes it.
+        """Convert to a `fusion.Measurement`.
 
         Raises:
             InvalidRequest: see `fusion.Measurement`.
@@ -66,12 +66,12 @@ class MeasurementBody(Strict):
         )
 
 
-Sigma = Annotated[float, Field(gt=0.0, le=10.0, description="standard deviation of what is believed beforehand, m")]
+Sigma = Annotated[float, Field(gt=0.0, le=10.0, description="standard deviation of the prior value, m")]
 Size = Annotated[float, Field(gt=0.0, le=100.0)]
 
 
 class CylinderBody(Strict):
-    """A post along its z axis, foot at z = 0; parts `wall` and `top`. Radius and length are estimated, m."""
+    """A post along z that stands on z = 0, with the parts `wall` and `top`. Radius and length are estimated, m."""
 
     kind: Literal["cylinder"]
     radius_m: Size
@@ -79,28 +79,28 @@ class CylinderBody(Strict):
     sigma_m: Sigma = 0.02
 
     def shape(self) -> Cylinder:
-        """The same as fusion takes it."""
+        """Convert to the shape of `fusion`."""
         from fusion import Cylinder
 
         return Cylinder(radius_m=self.radius_m, length_m=self.length_m, sigma_m=self.sigma_m)
 
 
 class BoxBody(Strict):
-    """A box about its origin; parts are the faces `+x` to `-z` and edges such as `+x+z`. Its three sizes are estimated, m."""
+    """A box about its origin, with faces `+x` to `-z` and edges such as `+x+z`. Its three sizes are estimated, m."""
 
     kind: Literal["box"]
     size_m: tuple[Size, Size, Size]
     sigma_m: Sigma = 0.02
 
     def shape(self) -> Box:
-        """The same as fusion takes it."""
+        """Convert to the shape of `fusion`."""
         from fusion import Box
 
         return Box(size_m=self.size_m, sigma_m=self.sigma_m)
 
 
 class ParameterBody(Strict):
-    """A measure of the object that is to be estimated, m."""
+    """A dimension of the object that is to be estimated, m."""
 
     name: ObjectName
     start_m: Length
@@ -117,10 +117,10 @@ class MovingPartBody(Strict):
     slopes: Annotated[dict[str, Vector3], Field(max_length=20)] = {}
 
     def moving(self, parameters: tuple[str, ...]) -> MovingPart:
-        """The same as fusion takes it, with a slope for each of the parameters.
+        """Convert to a `fusion.shapes.MovingPart`, with a slope for each of the parameters.
 
         Raises:
-            InvalidRequest: a line or plane without direction.
+            InvalidRequest: a line or plane has no direction.
         """
         from fusion import Feature, Kind, MovingPart, unit
 
@@ -136,7 +136,7 @@ class MovingPartBody(Strict):
 
 
 class FeatureSetBody(Strict):
-    """Any points, lines and planes whose places depend linearly on parameters, all of which are estimated."""
+    """Points, lines and planes whose positions depend linearly on parameters, all of which are estimated."""
 
     kind: Literal["features"]
     parameters: Annotated[tuple[ParameterBody, ...], Field(min_length=1, max_length=20)]
@@ -147,14 +147,14 @@ class FeatureSetBody(Strict):
         known = {p.name for p in self.parameters}
         for part in self.parts:
             if unknown := set(part.slopes) - known:
-                raise ValueError(f"part {part.name!r} depends on {sorted(unknown)}, which is no parameter")
+                raise ValueError(f"part {part.name!r} depends on {sorted(unknown)}, which is not a parameter")
         return self
 
     def shape(self) -> FeatureSet:
-        """The same as fusion takes it.
+        """Convert to the shape of `fusion`.
 
         Raises:
-            InvalidRequest: a line or plane without direction.
+            InvalidRequest: a line or plane has no direction.
         """
         from fusion import FeatureSet
 
@@ -171,23 +171,27 @@ ShapeBody = Annotated[CylinderBody | BoxBody | FeatureSetBody, Field(discriminat
 
 
 class FuseRequest(Strict):
-    """Fuse measurements into one pose: those given, or those that the cell collects itself."""
+    """Fuse measurements into one pose: the given ones, or those that the cell collects itself."""
 
     model_config = ConfigDict(json_schema_extra={"examples": FUSE_EXAMPLES})
 
     measurements: Annotated[tuple[MeasurementBody, ...], Field(max_length=10_000)] = ()
-    collect: Annotated[bool, Field(description="look, scan, touch and measure distances first")] = False
+    collect: Annotated[
+        bool, Field(description="collect the measurements first: images, range scan, touches and distances")
+    ] = False
     touches: Touches = 4
     wanted: WantedPose = WantedPose()
     prior: PoseBody | None = None
     certify: Annotated[bool, Field(description="prove global optimality by a semidefinite relaxation")] = False
     prove_set_within_s: Annotated[
         float | None,
-        Field(gt=0.0, le=60.0, description="prove by branch and bound which of at most 16 measurements to believe, s"),
+        Field(
+            gt=0.0,
+            le=60.0,
+            description="prove by branch and bound, within this time, which of at most 16 measurements are inliers, s",
+        ),
     ] = None
-    shape: Annotated[
-        ShapeBody | None, Field(description="the object's own measures are estimated too; needs `prior`")
-    ] = None
+    shape: Annotated[ShapeBody | None, Field(description="estimate the object's dimensions too; needs `prior`")] = None
 
     @model_validator(mode="after")
     def _has_something_to_fuse(self) -> FuseRequest:
@@ -196,9 +200,9 @@ class FuseRequest(Strict):
         if self.collect and (self.measurements or self.shape is not None):
             raise ValueError("collect = true takes neither measurements nor a shape")
         if self.shape is not None and self.prior is None:
-            raise ValueError("a shape needs `prior`, a believed pose to start from")
+            raise ValueError("a shape needs `prior`, a pose to start from")
         if self.shape is not None and (self.certify or self.prove_set_within_s is not None):
-            raise ValueError("nothing is proven about a shape: leave out certify and prove_set_within_s")
+            raise ValueError("certify and prove_set_within_s are not possible with a shape")
         if self.shape is None and any(m.part for m in self.measurements):
             raise ValueError("a measurement names a part, but there is no shape")
         return self

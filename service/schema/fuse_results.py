@@ -1,4 +1,4 @@
-"""The answer of `fuse`: the pose, and how each measurement agrees with it."""
+"""The answer of `fuse`: the pose, and the agreement of each measurement with it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PlacementField = Annotated[Placement, BeforeValidator(_placed)]
 
 
 class MeasurementResult(Result):
-    """How one measurement agrees with the answer; `value` is its squared distance in sigmas on `dof`."""
+    """The agreement of one measurement with the pose; `value` is chi-square with `dof` degrees of freedom."""
 
     label: str
     sensor: str
@@ -36,7 +36,7 @@ class MeasurementResult(Result):
 
 
 class RejectedMeasurement(Result):
-    """A measurement that was not used; index -1 is the prior."""
+    """A measurement that was not used; index -1 is the prior pose."""
 
     index: int
     label: str
@@ -45,14 +45,14 @@ class RejectedMeasurement(Result):
 
 
 class AlternativePose(EstimatedPose):
-    """Another pose that the measurements allow; `odds` relative to the answer."""
+    """Another pose that the measurements allow; `odds` is its probability relative to the answer."""
 
     odds: float
     rejected: list[int]
 
 
 class CertificateResult(Result):
-    """What the relaxation proves: `tight` means that no other pose fits the same measurements better."""
+    """The result of the relaxation; `tight` means proof that no other pose fits the same measurements better."""
 
     tight: bool
     gap: float
@@ -63,7 +63,7 @@ class CertificateResult(Result):
 
 
 class ProvenSetResult(Result):
-    """Which measurements to believe, by branch and bound; `gap` is what the deadline left undecided."""
+    """The best set of measurements by branch and bound; `gap` is the difference of the bounds at the deadline."""
 
     believed: list[int]
     cost: float
@@ -76,7 +76,7 @@ class ProvenSetResult(Result):
 
 
 class ShapeResult(Result):
-    """The object's own measures, which were estimated with its pose, m."""
+    """The object's dimensions, which were estimated together with its pose, m."""
 
     names: list[str]
     values: Numbers
@@ -85,13 +85,13 @@ class ShapeResult(Result):
 
 
 class TouchResult(Result):
-    """What a touched place was expected to bring, and what it brought.
+    """The expected and the real gain of a touched place.
 
     Attributes:
         spot_m: the place, panel frame.
-        error_before, error_expected, error_after: mean square error of the pose in units of the wanted one: before the
-            touch, as expected after it, and after it with the readings that really came.
-        words: the same as a sentence.
+        error_before, error_expected, error_after: mean square error of the pose in units of the wanted accuracy:
+            before the touch, as expected after it, and with the readings of the touch.
+        words: the same as text.
     """
 
     spot_m: Numbers
@@ -102,7 +102,7 @@ class TouchResult(Result):
 
 
 class TouchingResult(Result):
-    """The places touched in order, those that could not be touched and why, and why touching ended."""
+    """The touched places in order, those that could not be touched and why, and why touching ended."""
 
     touches: list[TouchResult]
     skipped: list[str]
@@ -110,26 +110,28 @@ class TouchingResult(Result):
 
 
 class FuseResult(EstimatedPose):
-    """The fused pose (`base_from_object`), and how each measurement agrees with it."""
+    """The fused pose (`base_from_object`), and the agreement of each measurement with it."""
 
     chi_square: float
     dof: int
     warnings: list[str]
     ambiguous: bool
-    unobservable: Annotated[list[str], Field(description="motions that the measurements leave free, in words")]
+    unobservable: Annotated[
+        list[str], Field(description="motions of the object that the measurements do not determine, in words")
+    ]
     measurements: list[MeasurementResult]
     rejected: list[RejectedMeasurement]
     alternatives: list[AlternativePose]
     certificate: CertificateResult | None
     proven_set: ProvenSetResult | None
     shape: ShapeResult | None
-    touching: Annotated[TouchingResult | None, Field(description="when the cell collected the measurements itself")] = (
-        None
-    )
+    touching: Annotated[
+        TouchingResult | None, Field(description="the touches, if the cell collected the measurements itself")
+    ] = None
 
 
 def answer_of(pose: UncertainPose, fused: FusedPose, measurements: Sequence[Measurement]) -> FuseResult:
-    """The fused pose as reports and the API give it; `pose` is the same pose in the frames that the caller means."""
+    """Return the fused pose in the form of reports and the API; `pose` is that pose in the caller's frames."""
     rejected = {r.index: r for r in fused.rejected}
     return FuseResult(
         **fields_of(estimated(pose)),
@@ -166,7 +168,7 @@ def answer_of(pose: UncertainPose, fused: FusedPose, measurements: Sequence[Meas
 
 
 def _warnings(fused: FusedPose) -> list[str]:
-    """What a caller should look at although there is an answer."""
+    """Return warnings about a result that is probably wrong."""
     if not fused.agrees_too_well:
         return []
     return [

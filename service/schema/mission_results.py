@@ -1,4 +1,4 @@
-"""Answers of `manipulate`, `missions` and `judge`, which reports keep, too."""
+"""Answers of `manipulate`, `missions` and `judge`, which are also part of reports."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from service.schema.results import Numbers, Pictures, Result
 
 
 class ReadingResult(Result):
-    """What one object showed at one look of a mission; `shows` is the same in words."""
+    """One reading of an object during a mission; `shows` is the same as text."""
 
     name: str
     kind: str
@@ -24,7 +24,7 @@ class ReadingResult(Result):
 
 
 class ActionResult(Result):
-    """One control that was worked: what was asked, what the skill reports, and what a second look showed."""
+    """One control that was operated: the target, the report of the skill, and the readings before and after."""
 
     object: str
     skill: str
@@ -40,14 +40,14 @@ class ActionResult(Result):
 
 
 class ManipulateResult(Result):
-    """The action, and a picture of the second look."""
+    """The action, and a picture of the read-back."""
 
     action: ActionResult
     pictures: Pictures
 
 
 class MissionResult(Result):
-    """How a mission ended; `report` is the address of its report, null when it could not be written."""
+    """The result of a mission; `report` is the address of its report, null when it could not be written."""
 
     mission: str
     succeeded: bool
@@ -59,7 +59,7 @@ class MissionResult(Result):
 
 
 class ObjectPlace(Result):
-    """An object in 3-D: its middle in the base frame, m."""
+    """The position of an object: its middle in the base frame, m."""
 
     name: str
     kind: str
@@ -67,16 +67,17 @@ class ObjectPlace(Result):
 
 
 class SurfaceCheck(Result):
-    """What the surfaces of one object say beside layout and vision.
+    """Comparison of one object's surfaces with the panel file and with vision.
 
     Attributes:
-        agrees: place and state agree; null when it was not found.
-        centre_in_base_m: (3,) its middle on the plate, base frame.
-        off_m: along the plate, from its place in the panel file under the panel's newest pose; `sigma_m` one standard
-            deviation of that, `chi_square` its square in sigmas on two degrees of freedom. Null when it was not found.
-        off_vision_m: along the plate, from where the newest image has it.
-        shows, vision_shows: its state by surfaces, and by vision.
-        finding: all that as a sentence.
+        agrees: whether place and state agree; null when the object was not found.
+        centre_in_base_m: (3,) the object's middle on the plate, base frame.
+        off_m: distance along the plate from the place in the panel file, with the panel's newest pose; null when the
+            object was not found.
+        sigma_m, chi_square: one standard deviation of `off_m`, and chi-square with two degrees of freedom.
+        off_vision_m: distance along the plate from the place in the newest image.
+        shows, vision_shows: the state by surfaces, and by vision.
+        finding: all of this as text.
     """
 
     name: str
@@ -96,7 +97,7 @@ class SurfaceCheck(Result):
 
 
 class ReadingClaim(Result):
-    """What a report says of a reading, and what was true."""
+    """A reading in a report, and the truth."""
 
     name: str
     what: str
@@ -106,20 +107,20 @@ class ReadingClaim(Result):
 
 
 class ActionClaim(ReadingClaim):
-    """The same of an action; `reached`: the control really stands where it was asked to."""
+    """An action in a report, and the truth; `reached` means that the control truly reached its target."""
 
     reached: bool
 
 
 class UnaskedMotion(Result):
-    """Something that moved although nobody worked it."""
+    """An object whose state changed although it was not operated."""
 
     name: str
     truth: str
 
 
 class EvaluateResult(Result):
-    """A mission's report against the simulator's truth."""
+    """Comparison of a mission's report with the simulator's truth."""
 
     pose_error_m: float | None
     pose_error_rad: float | None

@@ -1,4 +1,4 @@
-"""Bodies of the verbs: strict, with units in the names; unknown keys and numbers that are not finite are refused."""
+"""Bodies of the verbs, with units in the names; unknown keys and numbers that are not finite are refused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Vector3 = tuple[float, float, float]
 
 def _of_a_length(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     if sum(q * q for q in quaternion) < 1e-12:
-        raise ValueError("a quaternion of zero length is no rotation")
+        raise ValueError("a quaternion of zero length is not a rotation")
     return quaternion
 
 
@@ -34,16 +34,16 @@ LeastConfidence = Annotated[
     Field(
         ge=0.0,
         le=1.0,
-        description="readings that are less sure are refused with a reason; 0 gives the best guess of each, with its confidence",
+        description="readings with a lower confidence are refused with a reason; 0 returns the best guess for every object",
         examples=[0.0, 0.9],
     ),
 ]
-ANSWER_AT = 0.5  # as the readers have it
+ANSWER_AT = 0.5  # the default of the readers
 Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 
 class PoseBody(Strict):
-    """A pose with its covariance: 6x6 row by row over (dx, dy, dz, rx, ry, rz), m and rad, parent axes."""
+    """A pose with its 6x6 covariance (list of rows) over (dx, dy, dz, rx, ry, rz), m and rad, parent axes."""
 
     translation_m: Point
     quaternion_xyzw: Quaternion
@@ -52,7 +52,7 @@ class PoseBody(Strict):
     ]
 
     def pose(self) -> UncertainPose:
-        """The value that operations compute with."""
+        """Convert to an `UncertainPose`."""
         import numpy as np
 
         return UncertainPose(parent_from_child=from_json(self.model_dump()), covariance=np.array(self.covariance))
@@ -61,12 +61,14 @@ class PoseBody(Strict):
 class PanelPoseRequest(Strict):
     """Locate the panel by its four lights."""
 
-    move: Annotated[bool, Field(description="drive to a view of the whole panel first; false looks from here")] = True
+    move: Annotated[
+        bool, Field(description="drive to a view of the whole panel first; if false, the arm stays where it is")
+    ] = True
     scan: Annotated[bool, Field(description="also fit the plate's plane to a range image")] = False
 
 
 class LensBody(Strict):
-    """A camera's lens: pinhole and radial-tangential; `distortion` is k1, k2, p1, p2, k3 as OpenCV has them."""
+    """A camera's lens: pinhole with radial and tangential distortion (k1, k2, p1, p2, k3, as in OpenCV)."""
 
     fx_px: Annotated[float, Field(gt=0.0, le=1e6)]
     fy_px: Annotated[float, Field(gt=0.0, le=1e6)]
@@ -76,23 +78,29 @@ class LensBody(Strict):
 
 
 class StoredLook(Strict):
-    """What may be asked of a stored image instead of a live camera; nothing moves then."""
+    """Options for a stored image, which is used instead of a live camera; nothing moves then."""
 
-    image: Annotated[ImageId | None, Field(description="id of a stored image (POST /v1/images); else the camera's")] = (
+    image: Annotated[
+        ImageId | None, Field(description="id of a stored image (POST /v1/images); if null, the camera takes an image")
+    ] = None
+    panel: Annotated[ObjectName | None, Field(description="name of a taught panel; if null, the cell's own panel")] = (
         None
     )
-    panel: Annotated[ObjectName | None, Field(description="a taught panel; else the cell's")] = None
-    plate_m: Annotated[PlateSize | None, Field(description="width and height of the plate; else the panel's")] = None
-    camera: Annotated[ObjectName | None, Field(description="whose image, or whose lens took the stored one")] = None
-    lens: Annotated[LensBody | None, Field(description="the lens that took the stored image")] = None
+    plate_m: Annotated[
+        PlateSize | None, Field(description="width and height of the plate; if null, those of the panel")
+    ] = None
+    camera: Annotated[
+        ObjectName | None, Field(description="camera that takes the image, or that took the stored one")
+    ] = None
+    lens: Annotated[LensBody | None, Field(description="lens that took the stored image")] = None
     camera_from_panel: Annotated[
-        PoseBody | None, Field(description="where the panel was; else its border is looked for")
+        PoseBody | None, Field(description="pose of the panel; if null, the panel's border is looked for")
     ] = None
 
     @model_validator(mode="after")
     def _is_of_one_kind(self) -> StoredLook:
         if self.image is None and (self.panel or self.plate_m or self.lens or self.camera_from_panel):
-            raise ValueError("panel, plate_m, lens and camera_from_panel go with a stored `image`")
+            raise ValueError("panel, plate_m, lens and camera_from_panel need a stored `image`")
         if self.lens is not None and self.camera is not None:
             raise ValueError("give a lens or a camera's name, not both")
         if self.camera_from_panel is not None and self.lens is None and self.camera is None:
@@ -101,7 +109,7 @@ class StoredLook(Strict):
 
 
 class RecogniseRequest(StoredLook):
-    """Find the objects of a panel file in an image, of any panel (`blind`), or surfaces in the range image."""
+    """Find the objects of a panel file (`taught`) or of any panel (`blind`) in an image, or surfaces in a range image."""
 
     use: Annotated[tuple[Literal["vision", "range"], ...], Field(min_length=1)] = ("vision",)
     mode: Literal["taught", "blind"] = "taught"
@@ -123,35 +131,40 @@ class InspectRequest(StoredLook):
 
     objects: Annotated[tuple[ObjectName, ...], Field(max_length=200)] | None = None
     close_up: Annotated[
-        bool, Field(description="drive to close-ups, and aside of what they cannot read; false reads the overview only")
+        bool,
+        Field(
+            description="drive to close-ups, and to side views of unreadable objects; if false, read the overview only"
+        ),
     ] = True
     least_confidence: LeastConfidence = ANSWER_AT
 
 
 class LearnRequest(StoredLook):
-    """Learn what the panel's objects look like, from an overview of the cell's camera or a stored one."""
+    """Learn what the panel's objects look like, from a new or a stored overview."""
 
     move: Annotated[bool, Field(description="locate the panel and drive to the overview first")] = True
 
 
-Touches = Annotated[int, Field(ge=3, le=12, description="at most so many touches; fewer when the pose is good enough")]
+Touches = Annotated[
+    int, Field(ge=3, le=12, description="largest number of touches; fewer are made when the pose is accurate enough")
+]
 
 
 class WantedPose(Strict):
-    """How well the panel's pose is wanted: one standard deviation over all axes. Touching ends when it is that good."""
+    """The wanted accuracy of the panel's pose: one standard deviation over all axes. Touching ends when it is reached."""
 
     position_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.001
     angle_rad: Annotated[float, Field(gt=0.0, le=1.0)] = 0.0012
 
     def tolerance(self) -> PoseTolerance:
-        """The same as the planning of measurements takes it."""
+        """Convert to a `fusion.PoseTolerance`."""
         from fusion import PoseTolerance
 
         return PoseTolerance(position_m=self.position_m, angle_rad=self.angle_rad)
 
 
 class ActionBody(Strict):
-    """One deed: `state` for levers, toggles, rotaries and buttons, `value` for sliders, `angle_rad` for wheels."""
+    """One action: `state` for levers, toggles, rotaries and buttons, `value` for sliders, `angle_rad` for handwheels."""
 
     object: ObjectName
     state: Annotated[str, Field(max_length=41)] | None = None
@@ -166,13 +179,15 @@ class ActionBody(Strict):
 
 
 class ManipulateRequest(ActionBody):
-    """Work one control and look whether it worked."""
+    """Operate one control and read back whether it reached its target."""
 
-    verify: Annotated[bool, Field(description="look again afterwards; without it the outcome is `unverified`")] = True
+    verify: Annotated[
+        bool, Field(description="read the control back afterwards; if false, the outcome is `unverified`")
+    ] = True
 
 
 class MissionRequest(Strict):
-    """The whole mission. Without actions: lever, slider, button and toggle of the panel file, one each."""
+    """The whole mission. Without `actions` one lever, one slider, one button and one toggle are operated."""
 
     actions: Annotated[tuple[ActionBody, ...], Field(max_length=50)] | None = None
     touches: Touches = 4
@@ -180,41 +195,47 @@ class MissionRequest(Strict):
 
 
 class CalibrationRequest(Strict):
-    """Measure where a sensor sits, how a lens bends, or what the tool weighs; the arm drives through the poses itself."""
+    """Measure a sensor's mount, a lens, or the weight of the tool; the arm drives through the poses by itself."""
 
     what: Annotated[
         Literal["camera", "hand-eye", "scanner", "tool"],
         Field(
-            description="`camera`: lens and mount; `hand-eye`: mount, the lens being known; `scanner`: mount of the range "
+            description="`camera`: lens and mount; `hand-eye`: mount of a camera with a known lens; `scanner`: mount of the range "
             "scanner; `tool`: bias of the force/torque sensor, weight and centre of the tool"
         ),
     ]
-    device: Annotated[ObjectName | None, Field(description="which one; else the first of its kind")] = None
-    poses: Annotated[int, Field(ge=4, le=40, description="so many stations are measured")] = 12
-    dry_run: Annotated[bool, Field(description="only plan the stations; nothing moves, nothing is written")] = False
+    device: Annotated[ObjectName | None, Field(description="device to calibrate; if null, the first of its kind")] = (
+        None
+    )
+    poses: Annotated[int, Field(ge=4, le=40, description="number of stations")] = 12
+    dry_run: Annotated[bool, Field(description="only plan the stations; nothing moves and nothing is written")] = False
 
 
 class EvaluateRequest(Strict):
-    """Compare a finished mission's report with what the simulator says (simulated cells only)."""
+    """Compare a finished mission's report with the simulator's truth (simulated cells only)."""
 
     mission: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}$")]
 
 
 class ReadPhotographRequest(Strict):
-    """Read one instrument in a stored photograph, with nothing taught but its kind and its scale."""
+    """Read one instrument in a stored photograph, of which only the kind and the scale are known."""
 
     image: Annotated[ImageId, Field(description="id of a stored image (POST /v1/images)")]
     kind: Annotated[
         Literal["gauge", "dial", "display"],
-        Field(description="gauge: part of a turn; dial: a full turn that begins straight up; display: seven segments"),
+        Field(
+            description="gauge: scale over part of a turn; dial: full turn from straight up; display: seven segments"
+        ),
     ]
     scale: Annotated[
-        tuple[float, float] | None, Field(description="least and greatest value of a gauge's or a dial's scale")
+        tuple[float, float] | None, Field(description="smallest and largest value of a gauge's or dial's scale")
     ] = None
     ends_rad: Annotated[
         tuple[float, float] | None,
-        Field(description="a gauge's pointer angles there, clockwise from straight up; else its ticks tell"),
+        Field(
+            description="a gauge's pointer angles at the ends of the scale, clockwise from up; if null, read from its ticks"
+        ),
     ] = None
-    unit: Annotated[str, Field(max_length=40, description="of the scale, repeated in the answer")] = ""
-    is_scene: Annotated[bool, Field(description="the display is somewhere in the picture, not cropped")] = False
+    unit: Annotated[str, Field(max_length=40, description="unit of the scale, repeated in the answer")] = ""
+    is_scene: Annotated[bool, Field(description="the picture is not cropped to the display")] = False
     least_confidence: LeastConfidence = ANSWER_AT

@@ -1,7 +1,7 @@
-"""Answers of the verbs, as they stand in a task's `result`, in reports and in the API document.
+"""Answers of the verbs, as in a task's `result`, in reports and in the API document.
 
 Lengths are metres, angles radians, forces newtons. A covariance is 6x6 over (dx, dy, dz, rx, ry, rz) in the parent's axes.
-A field is null where it does not apply to what was asked.
+A field is null if it does not apply to the request.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hal.geometry import UncertainPose, to_json
 
 
 def _plain(value: Any) -> Any:
-    """Lists for arrays and tuples of arrays."""
+    """Convert arrays and tuples of arrays to lists."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
@@ -28,20 +28,20 @@ Pictures = Annotated[list[str], Field(description="addresses of the task's pictu
 
 
 class Result(BaseModel):
-    """Base of every answer."""
+    """Base class of every answer."""
 
     model_config = ConfigDict(frozen=True, from_attributes=True)
 
 
 class Placement(Result):
-    """Where something is: translation and unit quaternion."""
+    """A pose: translation and unit quaternion."""
 
     translation_m: Numbers
     quaternion_xyzw: Numbers
 
 
 class EstimatedPose(Placement):
-    """A pose with its covariance, and one standard deviation of each axis for people."""
+    """A pose with its covariance, and with the standard deviation of each axis."""
 
     covariance: Rows
     sigma_m: Numbers
@@ -49,7 +49,7 @@ class EstimatedPose(Placement):
 
 
 def estimated(pose: UncertainPose) -> EstimatedPose:
-    """A pose as an answer has it."""
+    """Convert a pose to the form of an answer."""
     sigma = np.sqrt(np.diag(pose.covariance))
     place = to_json(pose.parent_from_child)
     return EstimatedPose.model_validate(
@@ -58,7 +58,7 @@ def estimated(pose: UncertainPose) -> EstimatedPose:
 
 
 def fields_of(result: Result) -> dict[str, Any]:
-    """The fields of an answer, for one that has them and more."""
+    """Return the fields of an answer, for a model that extends it."""
     return {name: getattr(result, name) for name in type(result).model_fields}
 
 
@@ -66,23 +66,23 @@ def fields_of(result: Result) -> dict[str, Any]:
 
 
 class PlateInScanner(Result):
-    """The plate's plane in the scanner's frame."""
+    """The plane of the plate in the scanner's frame."""
 
     point_m: Numbers
     normal: Numbers
 
 
 class FittedPlate(PlateInScanner):
-    """The plate's plane with the scatter of the points that it was fitted to."""
+    """The plane of the plate with the scatter of the fitted points."""
 
     rms_m: float
 
 
 class PanelPoseResult(Result):
-    """Where the panel stands, by its four lights."""
+    """The pose of the panel from its four lights."""
 
     base_from_panel: EstimatedPose
-    chi_square: Annotated[float, Field(description="of the fit, on 2 degrees of freedom")]
+    chi_square: Annotated[float, Field(description="chi-square of the fit, with 2 degrees of freedom")]
     ambiguous: bool
     alternatives: int
     lights_px: dict[str, Numbers]
@@ -93,7 +93,7 @@ class PanelPoseResult(Result):
 
 
 class PossibleNumber(Result):
-    """A number that what is seen of a refused display allows, with its probability."""
+    """A number that a refused display may show, with its probability."""
 
     text: str
     value: float
@@ -101,7 +101,7 @@ class PossibleNumber(Result):
 
 
 class ObjectResult(Result):
-    """What one object of a panel file shows. A refusal has a `reason` and neither value, state nor text."""
+    """The reading of one object. A refused reading has a `reason` and neither value, state nor text."""
 
     name: str
     kind: str
@@ -120,16 +120,16 @@ class ObjectResult(Result):
 
 
 class CandidateResult(Result):
-    """A place where an object of some kind may be; `reason` says why it is refused."""
+    """A possible object found by blind recognition; `reason` says why it was refused."""
 
     kind: str
     confidence: float
     centre_px: Numbers
-    centre_m: Annotated[Numbers, Field(description="on the plate, from its middle, y up")]
-    place_m: Annotated[Numbers, Field(description="the part of the object that shows best")]
+    centre_m: Annotated[Numbers, Field(description="x, y on the plate, from its middle, y up")]
+    place_m: Annotated[Numbers, Field(description="place of the object's most distinct part")]
     box_px: Rows
-    distance: Annotated[float, Field(description="to the likeliest look")]
-    rival: Annotated[tuple[str, float], Field(description="the next kind and its distance")]
+    distance: Annotated[float, Field(description="distance to the nearest look of this kind")]
+    rival: Annotated[tuple[str, float], Field(description="the second nearest kind and its distance")]
     reason: str | None
 
 
@@ -144,7 +144,7 @@ class SurfaceResult(Result):
 
 
 class SurfaceSighting(Result):
-    """An object of the panel file that was looked for by its surfaces; `why` says why it was not found."""
+    """The result of looking for an object by its surfaces; `why` says why it was not found."""
 
     name: str
     kind: str
@@ -156,25 +156,25 @@ class SurfaceSighting(Result):
     state_sigma: float | None = None
     seen: Annotated[float | None, Field(description="share of its pixels where the range image agrees with it")] = None
     score: float | None = None
-    surfaces: Annotated[dict[str, int] | None, Field(description="its surfaces among those of the image")] = None
+    surfaces: Annotated[dict[str, int] | None, Field(description="labels of its surfaces in the range image")] = None
 
 
 class InspectResult(Result):
-    """What the objects of a panel show, which of them are not there, and annotated pictures."""
+    """The readings of a panel's objects, the missing ones, and annotated pictures."""
 
-    panel: Annotated[str | None, Field(description="of a stored image")] = None
+    panel: Annotated[str | None, Field(description="name of the panel in a stored image")] = None
     objects: list[ObjectResult]
     missing: list[str]
     pictures: Pictures
 
 
 class RecogniseResult(Result):
-    """Objects of the panel file, or candidates of a blind look, and surfaces of the range image, as asked."""
+    """Objects of the panel file or candidates of blind recognition, and surfaces of the range image."""
 
-    panel: Annotated[str | None, Field(description="of a stored image")] = None
+    panel: Annotated[str | None, Field(description="name of the panel in a stored image")] = None
     objects: list[ObjectResult] | None = None
     missing: list[str] | None = None
-    candidates: Annotated[list[CandidateResult] | None, Field(description="of mode `blind`")] = None
+    candidates: Annotated[list[CandidateResult] | None, Field(description="with mode `blind`")] = None
     pictures: Pictures | None = None
     surfaces: Annotated[list[SurfaceResult] | None, Field(description="with `use` range")] = None
     plate: Annotated[int | None, Field(description="label of the panel's plate among the surfaces")] = None
@@ -184,7 +184,7 @@ class RecogniseResult(Result):
 
 
 class LearnResult(Result):
-    """What an overview taught: looks by kind, objects by name, and the files of the kinds that changed."""
+    """What was learned from an overview: new looks by kind, objects by name, and the changed files."""
 
     panel: str
     added: dict[str, int]
@@ -200,13 +200,13 @@ class LearnResult(Result):
 
 
 class StationResult(Placement):
-    """A pose of the flange that a calibration would measure from; joint angles where the wrist is turned in place."""
+    """A station of a calibration: the pose of the flange, and the joint angles if only the wrist turns."""
 
     joints_rad: Numbers | None = None
 
 
 class CalibrationChange(Result):
-    """How far the new record is from the one before; null for what a record does not hold."""
+    """The differences between the new record and the previous one; null for values that a record does not have."""
 
     moved_m: float | None = None
     turned_rad: float | None = None
@@ -215,7 +215,7 @@ class CalibrationChange(Result):
 
 
 class CalibrationResult(Result):
-    """The record that was measured and kept; with `dry_run` only the stations that would be measured from."""
+    """The record that was measured and stored; with `dry_run` only the planned stations."""
 
     what: str
     device: str
@@ -232,7 +232,7 @@ class CalibrationResult(Result):
 
 
 class PhotographGuess(Result):
-    """What a refusal would have said."""
+    """The best guess of a refused reading."""
 
     value: float | None
     uncertainty: float | None
@@ -240,17 +240,17 @@ class PhotographGuess(Result):
 
 
 class PhotographReading(Result):
-    """What an instrument in a photograph shows, or why that cannot be told.
+    """The reading of an instrument in a photograph, or the reason why it cannot be read.
 
-    `confidence` is the expected share of right answers among such readings; of a refusal, that its guess is right.
+    `confidence` is the probability that the reading is right; for a refused reading, that its guess is right.
     """
 
     kind: str
     answered: bool
-    value: Annotated[float | None, Field(description="in `unit`; of a display, the number that its text is")]
+    value: Annotated[float | None, Field(description="value in `unit`; for a display, its text as a number")]
     unit: str
     uncertainty: Annotated[float | None, Field(description="one standard deviation of `value`")]
-    text: Annotated[str | None, Field(description="what a display shows")]
+    text: Annotated[str | None, Field(description="text of a display")]
     confidence: float
     reason: Annotated[str | None, Field(description="why there is no answer, and what would help")]
     guess: PhotographGuess | None

@@ -79,7 +79,7 @@ class Journal:
             done.result(APPEND_TIMEOUT_S)
         except TimeoutError as error:
             raise JournalError(
-                f"the journal {self.path} did not take a record in {APPEND_TIMEOUT_S:.0f} s",
+                f"the journal {self.path} did not store a record within {APPEND_TIMEOUT_S:.0f} s",
                 hint="the disk is too slow or hangs; nothing may move without a record",
             ) from error
 

@@ -205,7 +205,7 @@ class TaskStore:
         """Describe a motion task (running or queued) that this holder of the lease did not start; None without one."""
         for task in reversed(self.all()):  # the running task comes before the queued ones
             if task.moves and not task.state.is_final and task.holder != holder:
-                who = task.holder or "somebody without a lease"
+                who = task.holder or "a client without a lease"
                 return f"{task.verb} (task {task.id}) of {who} is {task.state}"
         return None
 

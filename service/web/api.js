@@ -1,4 +1,4 @@
-// Calls of the HTTP API. A problem (RFC 9457) becomes an Error whose message a person can read.
+// Calls the HTTP API. A problem (RFC 9457) becomes an Error with a readable message.
 
 export const FINAL = ["succeeded", "failed", "cancelled"]; // states of a task that has ended
 
@@ -11,7 +11,7 @@ export class ProblemError extends Error {
   }
 }
 
-// A browser's "Failed to fetch" tells nobody what to do.
+// Replaces a browser's "Failed to fetch", which does not say what to do.
 export async function ask(path, options) {
   try {
     return await fetch(path, options);
@@ -24,7 +24,7 @@ export async function get(path) {
   return answered(await ask(path, { cache: "no-store" }));
 }
 
-// The same, asked again until there is an answer: what a page cannot do without.
+// Repeats a GET request until there is an answer, for data that the page needs.
 export async function insist(path) {
   for (;;) {
     try {
@@ -40,7 +40,7 @@ export async function post(path, body) {
   return answered(await ask(path, { method: "POST", ...json }));
 }
 
-// A file as it is: its type says what it is.
+// Sends a file unchanged, with its own media type.
 export async function upload(path, data) {
   return answered(await ask(path, { method: "POST", headers: { "Content-Type": data.type }, body: data }));
 }
@@ -49,7 +49,7 @@ export async function remove(path) {
   return answered(await ask(path, { method: "DELETE" }));
 }
 
-// The task when it has ended well, however long that takes; a failed one is an Error as any other problem is.
+// Waits for the task and returns it if it has succeeded; a failed task becomes an Error.
 export async function finished(task) {
   while (!FINAL.includes(task.state)) task = await get(`/v1/tasks/${task.id}?wait_s=10`);
   if (task.state !== "succeeded") throw new ProblemError(task.problem || { detail: `the task was ${task.state}` }, 409);

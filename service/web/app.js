@@ -1,4 +1,4 @@
-// Puts the parts of the page together and tells the person when the service is out of reach.
+// Starts the parts of the page and shows when the service cannot be reached.
 import { insist, repeat } from "./api.js";
 import { startDevices } from "./devices.js";
 import { startLive } from "./live.js";
@@ -22,7 +22,7 @@ async function watchService() {
     banner.hidden = ready.is_ready;
     banner.textContent = `The cell is not ready. ${sick.detail || "It is starting."}`;
   } catch {
-    document.body.classList.add("lost"); // what is shown is what was known last
+    document.body.classList.add("lost"); // the page shows the last known state
     banner.hidden = false;
     banner.textContent = "The service does not answer. Is panelwright serve still running?";
   }

@@ -1,8 +1,8 @@
-// Health of all devices.
+// Shows the health of all devices.
 import { get, post, repeat } from "./api.js";
 
-const connecting = new Set(); // names of those that are being tried
-const trouble = new Map(); // what the newest try of each met
+const connecting = new Set(); // names of the devices that are being connected
+const trouble = new Map(); // error of the newest attempt, by device
 
 export function startDevices() {
   repeat(list, () => 2000);
@@ -38,7 +38,7 @@ function item(device) {
   return line;
 }
 
-// Why there is no device, and another try.
+// Shows why a device is missing, and a button to connect it again.
 function remedy(device) {
   const why = document.createElement("span");
   why.className = "quiet why";

@@ -1,4 +1,4 @@
-// Joints, force and contacts from the WebSocket stream.
+// Shows joints, force and contacts from the WebSocket stream.
 
 const live = document.querySelector("#live");
 const joints = document.querySelector("#joints");
@@ -23,7 +23,7 @@ function connect() {
 
 function draw(state) {
   if (!state.position_rad) return showWhyNot(state.problem || "no arm");
-  const isStale = state.faults.length > 0; // what is shown was so when the device was last heard
+  const isStale = state.faults.length > 0; // the values are those of the device's last answer
   live.classList.toggle("stale", isStale);
   joints.classList.toggle("stale", isStale);
   chip.title = state.faults.join("; ");
@@ -45,7 +45,7 @@ function draw(state) {
   joints.replaceChildren(...state.position_rad.map(joint));
 }
 
-// In words of any length: there is no state while a device that belongs to it is missing.
+// Shows as text why there is no state, for example because a device is missing.
 function showWhyNot(problem) {
   showState("no state", "failed");
   const why = document.createElement("p");

@@ -3,7 +3,7 @@ import { FINAL, get, post, repeat } from "./api.js";
 import { isClear, isLatched } from "./stop.js";
 
 const $ = (selector) => document.querySelector(selector);
-let followed = null; // id of the task whose events we show
+let followed = null; // id of the task whose events are shown
 let isActive = false;
 let canRun = false;
 
@@ -81,7 +81,7 @@ function addStep(timeS, step, detail, kind = "") {
 async function listTasks() {
   const { tasks } = await get("/v1/tasks?limit=8");
   const active = tasks.find((task) => !FINAL.includes(task.state));
-  if (active && active.id !== followed) follow(active); // somebody else started it
+  if (active && active.id !== followed) follow(active); // another client started it
   if (!active) isActive = false;
   enable();
   if (tasks.length) $("#tasks").replaceChildren(...tasks.map(row));

@@ -1,24 +1,24 @@
-// The software stop: the button talks to the stop process on its own port, and to the service as well, whichever is faster.
+// The software stop: the button asks the stop process on its own port and the service at the same time.
 import { get, post, repeat } from "./api.js";
 
 const box = document.querySelector("#stop-box");
 const line = document.querySelector("#stop-line");
 const reset = document.querySelector("#reset");
-const PATIENCE_MS = 5000; // after this the slower way to stop no longer delays a reset
+const PATIENCE_MS = 5000; // after this time the slower of the two requests no longer delays a reset
 let count = 0;
-let shownMs = 0; // since when, by a clock that nobody sets: a service that was started anew counts from the beginning
-let stopping = 0; // presses of which one way is still under way: it would latch again what was reset before it arrives
+let shownMs = 0; // monotonic time of the shown state, because the count of a restarted service begins again
+let stopping = 0; // presses with an unanswered request, which could latch the stop again after a reset
 
-// `stopUrl` is a promise: the button works from the first moment, and the stop process is told once its port is known.
+// `stopUrl` is a promise, so that the button works before the port of the stop process is known.
 export function startStop(stopUrl) {
   const stop = () => {
     line.textContent = "stopping …";
     stopping += 1;
     const askedMs = performance.now();
-    const known = Promise.race([stopUrl, after(PATIENCE_MS).then(() => Promise.reject(new Error("no port")))]); // never a late stop
+    const known = Promise.race([stopUrl, after(PATIENCE_MS).then(() => Promise.reject(new Error("no port")))]); // a stop must not arrive late
     const asked = [known.then((url) => fetch(url, { method: "POST" })).then((answer) => answer.json()), post("/v1/stop")];
     Promise.any(asked).then((state) => show(state, askedMs)).catch(() => (line.textContent = "NO ANSWER: use the hardware stop"));
-    const bothWays = Promise.allSettled(asked).then(look); // the slower of the two has raised the count again
+    const bothWays = Promise.allSettled(asked).then(look); // the slower request has increased the count again
     Promise.race([bothWays, after(PATIENCE_MS)]).catch(() => {}).then(allowReset);
   };
   document.querySelector("#stop").addEventListener("click", stop);

@@ -1,17 +1,17 @@
-// The image to click on: uploaded, stored, or taken by a camera of the cell; its clicks, and the outline drawn over it.
+// The image to click on (uploaded, stored, or taken by a camera of the cell) with its clicks and the outline over it.
 import { ProblemError, ask, get, upload } from "./api.js";
 
 const MOST_CLICKS = 3;
 const WAYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-const STEPS = 80; // of the keyboard's cross from side to side
+const STEPS = 80; // steps of the keyboard's cross over the width of the image
 const SVG = "http://www.w3.org/2000/svg";
 const $ = (selector) => document.querySelector(selector);
 const picture = $("#picture");
 let image = null; // the stored image that is shown
 let points = [];
 let cross = null; // where the keyboard would click, px
-let pointed = null; // takes the next click instead of the outline
-let isElsewhere = false; // a picture is shown that is not of this image: a click on it has no meaning
+let pointed = null; // function that receives the next click instead of the outline
+let isElsewhere = false; // whether a picture of another image is shown, on which clicks have no meaning
 let listeners = [];
 
 export const chosenImage = () => image && image.id;
@@ -93,7 +93,7 @@ function click(event) {
   pick(x, y);
 }
 
-// Without a mouse: arrow keys move a cross, with Shift by a pixel; Enter clicks where it stands.
+// Without a mouse, arrow keys move a cross (with Shift by one pixel), and Enter clicks there.
 function steer(event) {
   const way = WAYS[event.key];
   if (!image || (!way && event.key !== "Enter")) return;
@@ -113,7 +113,7 @@ function pick(x, y) {
     pointed(x, y);
     return pointAt(null);
   }
-  points = points.length >= MOST_CLICKS ? [[x, y]] : [...points, [x, y]]; // a fourth click begins anew
+  points = points.length >= MOST_CLICKS ? [[x, y]] : [...points, [x, y]]; // a fourth click starts again
   $("#clear").disabled = false;
   showPicture(null);
   tell();

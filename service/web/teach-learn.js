@@ -1,10 +1,10 @@
-// The looks of a known panel: learned from an overview that the arm drives to, or from the image.
+// Learns the looks of a known panel from an overview that the arm drives to, or from the image.
 import { FINAL, finished, get, post } from "./api.js";
 import { isClear } from "./stop.js";
 
 const $ = (selector) => document.querySelector(selector);
 
-// `tell` shows where it is and what came of it in words, `show` the result object by object.
+// `tell` shows progress and result as text, `show` the result object by object.
 export function startLearn({ chosenImage, attempt, tell, show }) {
   let isLearning = false;
   const fromImage = () => ({ image: chosenImage(), panel: $("#known-panel").value });
@@ -30,7 +30,7 @@ export function startLearn({ chosenImage, attempt, tell, show }) {
     enable();
   }
 
-  // Tells each step, since driving there takes a while.
+  // Shows each step, because driving there takes some time.
   async function followed(task) {
     while (!FINAL.includes(task.state)) {
       if (task.step) tell(`${task.step} …`);

@@ -1,4 +1,4 @@
-// A whole panel: objects one after the other, each with the questions that its kind asks.
+// Teaches a whole panel: its objects one after the other, each with the questions of its kind.
 import { get } from "./api.js";
 
 const $ = (selector) => document.querySelector(selector);
@@ -7,7 +7,7 @@ const POINTED = ["at_min", "at_max"]; // places that can be clicked on
 const fields = () => [...$("#questions").querySelectorAll("[data-key]")];
 const answerTo = (key) => fields().find((input) => input.dataset.key === key);
 
-// `clicks()` gives the present clicks, `pointAt` takes one more, `save` gets the finished lesson.
+// `clicks()` returns the present clicks, `pointAt` waits for one more, `save` receives the finished lesson.
 export function startPanel({ clicks, pointAt, save, attempt }) {
   let objects = [];
   let asked = 0;
@@ -33,12 +33,12 @@ export function startPanel({ clicks, pointAt, save, attempt }) {
     typed.forEach(keep);
   }
 
-  // What was typed before the questions of another kind came answers theirs too, the name above all.
+  // Answers typed before the kind was changed are kept for the new questions, above all the name.
   function keep({ dataset, value }) {
     const input = answerTo(dataset.key);
     if (!input) return;
     input.value = value;
-    if (input.value !== value) input.value = input.dataset.offered; // none of its choices
+    if (input.value !== value) input.value = input.dataset.offered; // the old answer is not one of its choices
   }
 
   function field(question) {
@@ -56,7 +56,7 @@ export function startPanel({ clicks, pointAt, save, attempt }) {
   function pointable(input) {
     const box = Object.assign(document.createElement("span"), { className: "pointed" });
     const button = Object.assign(document.createElement("button"), { type: "button", textContent: "point" });
-    const { key } = input.dataset; // its input may have been replaced when the click comes
+    const { key } = input.dataset; // the input may have been replaced before the click
     button.addEventListener("click", () => pointAt((x, y) => keep({ dataset: { key }, value: `${x.toFixed(1)},${y.toFixed(1)}` })));
     box.append(input, button);
     return box;

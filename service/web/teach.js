@@ -1,4 +1,4 @@
-// The teach page: choose an image, click on an object, see what was found, name it, save it, and look what is found now.
+// The teach page: choose an image, click on an object, see its outline, name it, save it, and check what is recognised.
 import { finished, get, insist, post, remove } from "./api.js";
 import { startLearn } from "./teach-learn.js";
 import { startStop } from "./stop.js";
@@ -7,9 +7,9 @@ import { startPanel } from "./teach-panel.js";
 
 const $ = (selector) => document.querySelector(selector);
 let outline = null; // what was found at the present clicks
-let lastPanel = null; // the panel that was saved last: checking reads it
+let lastPanel = null; // the panel that was saved last, which the check reads
 const MODES = ["kind", "panel", "looks"];
-let asked = 0; // clicks may come faster than answers: only the newest answer counts
+let asked = 0; // number of requests; only the answer to the newest one is shown
 
 const plate = () => [Number($("#plate-width").value), Number($("#plate-height").value)];
 const base = () => ({ image: chosenImage(), plate_m: plate() });
@@ -38,7 +38,7 @@ function words(found) {
   const [width, height] = found.size_m.map((side) => Math.round(1000 * side));
   const what = found.shape === "clicks" ? "No outline but edges inside your clicks" : `Found a ${found.shape}`;
   const sure = found.reason ? `, though ${found.reason}` : ` (${found.confidence?.toFixed(2)})`;
-  const name = found.taken_for ? `I take it for a ${found.taken_for.replaceAll("_", " ")}${sure}.` : "I do not know it yet.";
+  const name = found.taken_for ? `Recognised as ${found.taken_for.replaceAll("_", " ")}${sure}.` : "No known kind looks like it.";
   return `${what}, ${width} × ${height} mm. ${name}`;
 }
 
@@ -152,11 +152,11 @@ async function attempt(work) {
   }
 }
 
-// What a panel taught by its own looks: shown as the check is, object by object.
+// Shows what was learned from a known panel, object by object, as the check does.
 async function showLearned(result, isLive) {
   const rows = result.taught_by.map((name) => pair(name, result.known_now.includes(name) ? "recognised now" : "not recognised yet"));
   rows.push(...Object.entries(result.left_out).map(([name, why]) => {
-    const item = pair(name, "taught nothing");
+    const item = pair(name, "nothing learned");
     item.append(Object.assign(document.createElement("span"), { className: "refused", textContent: why }));
     return item;
   }));

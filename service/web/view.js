@@ -1,4 +1,4 @@
-// The live picture: asked for at a modest rate, only while somebody can see it, and slower while a task needs the cell.
+// Shows the live picture, requested only while the page is visible and less often while a task runs.
 import { ProblemError, ask, get, repeat } from "./api.js";
 
 const picture = document.querySelector("#picture");
@@ -40,7 +40,7 @@ async function show() {
     draw(name, await response.blob());
   } catch (problem) {
     line.textContent = `${problem.message} · ${problem.hint || ""}`;
-    picture.style.opacity = 0.35; // an old picture must not pass for a new one
+    picture.style.opacity = 0.35; // marks an old picture as such
   }
 }
 

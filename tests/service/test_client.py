@@ -147,18 +147,20 @@ def test_a_problem_is_an_error_with_its_hint_and_details(scripted: Client) -> No
 
 
 def test_another_server_at_the_address_is_told_apart_from_none(scripted: Client) -> None:
-    with pytest.raises(ConfigError, match="no panelwright"):
+    with pytest.raises(ConfigError, match="another program answers"):
         scripted.get("/v1/page")
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))  # bound, and nobody listens
-        with pytest.raises(DeviceUnavailable, match=r"no panelwright answers at .*: Connection refused") as refusal:
+        with pytest.raises(
+            DeviceUnavailable, match=r"no panelwright service answers at .*: Connection refused"
+        ) as refusal:
             Client(url=f"http://127.0.0.1:{unused.getsockname()[1]}").get("/v1/info")
     assert "--url" in refusal.value.hint
 
 
 @pytest.mark.parametrize("url", ["", "ftp://localhost", "http://", "http://[::1", "https://localhost:1"])
 def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None:
-    with pytest.raises(ConfigError, match="no address of a service"):
+    with pytest.raises(ConfigError, match="not the address of a service"):
         Client(url=url).get("/v1/info")
 
 

@@ -73,7 +73,7 @@ def test_the_dialogue_teaches_a_kind_and_shows_it(
     teach(tmp_path / "panel.png", folder=tmp_path / "kinds", dialogue=True)
     said = capsys.readouterr().out
     assert "is not pixels" in said and "beside the plate" in said and "is no name" in said
-    assert "'no' is no answer to what it is called" in said
+    assert "'no' cannot be a name" in said
     assert "found a circle of 40 x 40 mm" in said
     assert sum(line.startswith("mushroom at") for line in said.splitlines()) == 1
     assert [kind.name for kind in load_knowledge(tmp_path / "kinds").kinds] == ["mushroom"]

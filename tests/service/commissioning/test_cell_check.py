@@ -60,7 +60,7 @@ GOLDEN = {
     ),
     "no mount": (
         NO_MOUNT,
-        "devices.wrist_camera.mount: is missing: nobody knows where the camera sits",
+        "devices.wrist_camera.mount: is missing, so the pose of the camera is not known",
         'add mount = { parent = "flange", calibration = "wrist_camera" } and that calibration record',
     ),
     "unknown option": (

@@ -39,7 +39,7 @@ def test_the_kit_runs_on_a_cell_file_and_reports_what_was_not_tried(write_cell: 
     assert list(found["devices"]) == ["finger_proximity"]
     outcomes = {p["promise"]: (p["outcome"], p["why"]) for p in found["devices"]["finger_proximity"]["promises"]}
     assert outcomes["close twice is once"] == ("passed", "")
-    assert outcomes["later samples have later stamps and numbers"] == ("not tried", "level read was not asked for")
+    assert outcomes["later samples have later stamps and numbers"] == ("not tried", "level read was not requested")
     assert "| later samples have later stamps and numbers | read | not tried |" in text
 
 

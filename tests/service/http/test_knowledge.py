@@ -60,8 +60,8 @@ def test_a_new_kind_is_taught_listed_found_and_forgotten(web: httpx2.Client, sho
     found = web.post("/v1/recognise?wait_s=30", json=look).json()["result"]["candidates"]
     assert [c["kind"] for c in found if c["reason"] is None].count("mushroom") == 1
     assert web.delete("/v1/knowledge/kinds/mushroom").status_code == 204
-    is_problem(web.delete("/v1/knowledge/kinds/mushroom"), 404, "no-such-knowledge", "nobody taught")
-    is_problem(web.delete("/v1/knowledge/kinds/gauge"), 404, "no-such-knowledge", "nobody taught")
+    is_problem(web.delete("/v1/knowledge/kinds/mushroom"), 404, "no-such-knowledge", "no taught kind")
+    is_problem(web.delete("/v1/knowledge/kinds/gauge"), 404, "no-such-knowledge", "no taught kind")
 
 
 def test_a_whole_panel_is_taught_and_read(web: httpx2.Client, shown: Shown, house: Panelwright) -> None:
@@ -124,8 +124,8 @@ def test_one_kind_and_one_panel_are_shown(web: httpx2.Client, house: Panelwright
     assert not gauge["is_taught"] and parse_toml(gauge["toml"], KindRecord, source="answer").name == "gauge"
     own = house.service.cell.panel
     assert parse_toml(web.get(f"/v1/knowledge/panels/{own.name}").json()["toml"], Panel, source="answer") == own
-    is_problem(web.get("/v1/knowledge/kinds/teapot"), 404, "no-such-knowledge", "nothing of that name")
-    is_problem(web.get("/v1/knowledge/panels/teapot"), 404, "no-such-knowledge", "nothing of that name")
+    is_problem(web.get("/v1/knowledge/kinds/teapot"), 404, "no-such-knowledge", "there is no kind or panel")
+    is_problem(web.get("/v1/knowledge/panels/teapot"), 404, "no-such-knowledge", "there is no kind or panel")
 
 
 @pytest.mark.parametrize("lesson", ["outline", "kind", "panel"])

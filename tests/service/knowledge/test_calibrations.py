@@ -154,7 +154,7 @@ def test_a_mount_that_is_not_on_the_hand_is_refused(write_cell: WriteCell, tmp_p
         panelwright.start()
         with httpx2.Client(base_url=panelwright.url, timeout=60.0, trust_env=False) as http:
             answer = http.post("/v1/calibrations?wait_s=30", json={"what": "camera", "dry_run": True})
-        is_problem(answer, 409, "unsupported", "does not sit on the flange")
+        is_problem(answer, 409, "unsupported", "is not mounted on the flange")
     finally:
         panelwright.close()
 

@@ -66,7 +66,7 @@ def test_what_is_no_usable_image_is_not_kept(web: httpx2.Client, data: Callable[
 def test_an_upload_says_that_it_is_an_image_and_is_bounded(web: httpx2.Client, shown: Shown) -> None:
     for media in ("text/plain", "multipart/form-data", "application/json"):
         answer = web.post("/v1/images", content=png(shown[0]), headers={"Content-Type": media})
-        is_problem(answer, 415, "bad-body", "no image's")
+        is_problem(answer, 415, "bad-body", "not an image type")
     answer = web.post("/v1/images", content=b" " * 32_000_001, headers={"Content-Type": "image/png"})
     assert answer.status_code == 413
 

@@ -91,7 +91,7 @@ def test_what_stands_elsewhere_is_not_worked_and_others_are():
     row = check(sighting(WHEEL, off_m=(0.006, 0.0)))
     assert row.found and row.agrees is False and row.stands_elsewhere
     need_its_place([row], "stop")
-    with pytest.raises(NotFound, match=r"bypass is not worked.*6\.0 mm"):
+    with pytest.raises(NotFound, match=r"bypass is not operated.*6\.0 mm"):
         need_its_place([row], "bypass")
 
 

@@ -68,7 +68,7 @@ def follow(monkeypatch: pytest.MonkeyPatch, toucher: Toucher, made: TouchPlan, m
 def test_each_touch_brings_what_it_was_expected_to(monkeypatch: pytest.MonkeyPatch) -> None:
     felt = follow(monkeypatch, Toucher(), plan())
     assert len(felt.account.touches) == len(felt.observations) == 4
-    assert felt.account.ended == "as many places as asked for"
+    assert felt.account.ended == "the requested number of places was touched"
     for touch in felt.account.touches:
         assert touch.error_after == pytest.approx(touch.error_expected)
         assert touch.error_after < touch.error_before

@@ -88,7 +88,7 @@ def test_a_cap_that_no_side_shows_says_how_often_it_was_looked_at(
     monkeypatch.setattr(viewpoints, "CLOSE_SIDES", ("the left", "above"))  # from further off this one looks alike
     session.world.forget_reading("hold")
     reading = inspect_close(session, ("hold",)).readings["hold"]
-    assert not reading.answered and "(2 looks from the sides did not tell either)" in (reading.reason or "")
+    assert not reading.answered and "(2 views from the sides did not help)" in (reading.reason or "")
 
 
 def test_neighbours_that_cannot_be_read_are_looked_at_together(session: Session) -> None:

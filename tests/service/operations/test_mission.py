@@ -123,7 +123,7 @@ def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_
     assert wheel.stands_elsewhere and wheel.seen_from == CLOSER and moved > 0.05
     assert wheel.off_m == pytest.approx(0.008, abs=0.002)
     assert [picture.name for picture in pictures] == ["surfaces", "surfaces-bypass"]
-    with pytest.raises(NotFound, match="bypass is not worked"):
+    with pytest.raises(NotFound, match="bypass is not operated"):
         need_its_place(checks, "bypass")
 
 

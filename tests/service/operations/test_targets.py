@@ -46,7 +46,7 @@ NONSENSE = [
     ({"object": "emergency", "value": 3.0}, "takes state, not value", "'state'"),
     ({"object": "start", "state": "pressed"}, "no state 'pressed'", "on, off"),
     ({"object": "hold", "state": "on"}, "no state 'on'", "pressed, released"),
-    ({"object": "pressure", "value": 3.0}, "cannot be worked", "lever"),
+    ({"object": "pressure", "value": 3.0}, "cannot be operated", "lever"),
 ]
 
 

@@ -115,7 +115,7 @@ def test_every_grant_and_its_end_are_reported_with_the_epoch() -> None:
 
 
 def test_while_another_ones_task_moves_the_lease_is_not_free_but_can_be_taken_over() -> None:
-    moving = {"alice": None, "bob": "missions (task 7) of somebody without a lease is running"}
+    moving = {"alice": None, "bob": "missions (task 7) of a client without a lease is running"}
     losses = list[str]()
     lease = LeaseDesk(ttl_s=TTL_S, clock=SimClock(), on_loss=losses.append, others=moving.get)
     with pytest.raises(LeaseError, match=r"nobody holds the cell, but missions \(task 7\)") as caught:

@@ -1,6 +1,6 @@
-"""Readers, one file per kind: each turns a rectified patch and the panel file's description into a reading.
+"""Readers, one file per kind: each converts a rectified patch and the panel file's description into a reading.
 
-The names exported here are those that a package with a reader of its own needs.
+The exported names are those that a package with a reader of its own needs.
 """
 
 from __future__ import annotations

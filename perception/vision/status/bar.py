@@ -1,4 +1,4 @@
-"""Contrast of bars that stick out of a hub (knob marks, lever handles, toggle bats) against both of their sides."""
+"""Contrast of bars that extend from a hub (knob marks, lever handles, toggle bats) to both of their sides."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
 
 CORE = (-0.5, 0.0, 0.5)  # places across the bar, in half widths
-FLANK = (1.7, 2.1)
+FLANK = (1.7, 2.1)  # the same for the flanks
 LEAST_KNOWN = 0.35  # share of a bar's stations that must be visible
 
 
@@ -25,14 +25,17 @@ def bar_contrast(
     beside_m: float = 0.0,
     hidden: NDArray[np.bool_] | None = None,
 ) -> Array:
-    """(N,) signed contrast (gray levels) of a bar from the object's middle towards each angle, clockwise from up.
+    """Return the signed contrast (N,), gray levels, of a bar from the object's middle towards each angle.
 
-    At every station along the bar the core is compared with both flanks. The station counts with the smaller of the two
-    differences, and with 0 when their signs disagree (an edge, not a bar). The result is a low quantile over the
-    stations, with the sign of the bar: positive for bars brighter than their surroundings.
+    Angles are clockwise from up. At every station along the bar the core is compared with both flanks. The station
+    counts with the smaller of the two differences, and with 0 if their signs differ (an edge, not a bar). The result is
+    a low
+    quantile over the stations, with the sign of the bar: positive for bars brighter than their surroundings.
 
     Args:
+        along_m, half_width_m: distances of the bar's ends from the middle, and half its width.
         height_m: height above the plate of the bar's ends (inner, outer), or one height, or None for the patch's plane.
+        flank: distances of the flanks from the axis, in half widths.
         hidden: (H, W) mask of occluded pixels. Occluded stations are ignored; a bar that is mostly occluded has no
             contrast.
         beside_m: offset of the bar to the right of the line from the middle, parallel to it.
@@ -71,7 +74,10 @@ def bar_contrast(
 
 
 def _low(stations: Array, quantile: float) -> Array:
-    """Mean of the lower half around a quantile of the known stations; it is smoother than the quantile itself."""
+    """Return the mean of the lower half around a quantile of the known stations.
+
+    It is smoother than the quantile itself.
+    """
     ordered = np.sort(stations, axis=1)  # NaN (unknown) sorts last
     if not np.isnan(ordered[:, -1]).any():
         top = max(2, round(stations.shape[1] * 2 * quantile))

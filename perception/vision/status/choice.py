@@ -42,7 +42,7 @@ def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, 
 
 
 def contrast_noise(patch: Patch) -> float:
-    """Contrast (gray levels) that the means of small areas of this patch reach by chance."""
+    """Return the contrast (gray levels) that the means of small areas of this patch reach by chance."""
     below = np.cumsum(step_counts(np.ascontiguousarray(patch.gray), 1))
     middle = np.searchsorted(below, [(below[-1] + 1) // 2, below[-1] // 2 + 1])
     return float(max(1.5, 1.2 * middle.mean()))

@@ -15,7 +15,9 @@ from perception.vision.status.digit_grid import AXES, DigitGrid
 from perception.vision.status.digit_grid_worth import Float32
 
 RADIUS = 0.075  # of the digit height
-LEVEL = 0.47  # of a lit segment: dots blurred by motion have .4 to .6, gaps without one up to .37 (of 1400 drawn ones)
+LEVEL = (
+    0.47  # of a lit segment; dots blurred by motion have 0.4 to 0.6, gaps without one up to 0.37 (1400 synthetic ones)
+)
 LEVEL_SPREAD = 0.07
 MOST_TYPICAL = 0.37  # if gaps without a point exceed this, the stroke model is wrong
 MOST_ODDS = 6.0  # log odds at most: a brighter dot is not more certain, and two gaps with a dot each stay ambiguous
@@ -31,7 +33,7 @@ PLACES_Y = np.linspace(-0.12, 0.06, 7)  # in digit heights, from the bottom segm
 COLON_STRIP, COLON_LEVEL = (
     (0.0, 1.0),
     0.8,
-)  # colons of 36 drawn clocks have 1.1 or more, gaps of 75 sure numbers up to .6
+)  # colons of 36 synthetic clocks have 1.1 or more, gaps of 75 certain numbers up to 0.6
 COLON_Y = (np.linspace(-0.80, -0.58, 7), np.linspace(-0.42, -0.20, 7))
 LEAST_OF_DOT = 0.4  # visible share of a dot's template that is needed to estimate its height
 STEPS = 8  # samples per px of the tabulated stroke profiles
@@ -39,7 +41,7 @@ STEPS = 8  # samples per px of the tabulated stroke profiles
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DecimalPoint:
-    """Number of cells before the decimal point (None without one), and the probability that this is correct."""
+    """Number of cells before the decimal point (None if there is none), and the probability that this is correct."""
 
     place: int | None
     probability: float
@@ -69,7 +71,10 @@ def find_decimal_point(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels:
 
 
 def find_colon(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels: Array) -> int | None:
-    """Number of cells before a clock's colon, which is one dot in the upper and one in the lower half of a gap; or None."""
+    """Return the number of cells before a clock's colon; None if there is none.
+
+    A colon is one dot in the upper and one in the lower half of a gap.
+    """
     if grid.count < 2:
         return None
     dots = [dot_levels(ink, seen, grid, lit_levels, strip=COLON_STRIP, places_y=ys)[0] for ys in COLON_Y]
@@ -87,7 +92,9 @@ def dot_levels(
     strip: tuple[float, float] = STRIP,
     places_y: Array = PLACES_Y,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(cells - 1,) level of the best dot in every gap relative to lit segments beside it, and whether the gap is visible.
+    """Return the level (cells - 1,) of the best dot in every gap, relative to lit segments beside it.
+
+    Also returns whether each gap is visible.
 
     Args:
         strip: rows that are searched, in digit heights from the digit's top.
@@ -110,7 +117,7 @@ def dot_levels(
 
 
 def _beside(lit_levels: Array) -> Array:
-    """(cells - 1,) level of lit segments beside every gap. Behind glare a dot is as dim as its neighbours."""
+    """Return the level (cells - 1,) of lit segments beside every gap; behind glare a dot is as dim as they are."""
     lit = lit_levels > 0
     cells = np.where(lit.any(axis=1), (lit_levels * lit).sum(axis=1) / np.maximum(lit.sum(axis=1), 1), np.nan)
     if not np.isfinite(cells).any():
@@ -121,7 +128,7 @@ def _beside(lit_levels: Array) -> Array:
 
 
 def _dot(radius_px: float, sigma_px: float) -> Float32:
-    """Template of a disc that has unit height before it is blurred."""
+    """Return the template of a blurred disc, which has unit height before it is blurred."""
     half = int(np.ceil(radius_px + 2.5 * sigma_px))
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     disc = np.clip(radius_px + 0.5 - np.hypot(x, y), 0.0, 1.0).astype(np.float32)
@@ -129,7 +136,10 @@ def _dot(radius_px: float, sigma_px: float) -> Float32:
 
 
 def _drawn(strip: Float32, clear: Float32, grid: DigitGrid, lit_levels: Array, first: int) -> tuple[Float32, float]:
-    """The lit segments drawn with the stroke width and blur that minimise the residual, and that blur in px."""
+    """Draw the lit segments with the stroke width and blur that minimise the residual.
+
+    Returns picture and blur in px.
+    """
     h = grid.height_px
     shapes = [(half * h, max(blur * h, 0.3)) for half in HALF_STROKES for blur in BLURS]
     distance = np.arange(0.0, (HALF_STROKES[-1] + 2.5 * BLURS[-1]) * h + 1.0, 1.0 / STEPS)
@@ -144,7 +154,10 @@ def _drawn(strip: Float32, clear: Float32, grid: DigitGrid, lit_levels: Array, f
 
 
 def _closest(canvases: Float32, strip: Float32, clear: Float32) -> tuple[int, Float32, float]:
-    """Index of the (rows, columns, shapes) picture that fits the strip best, that picture scaled to fit, and the residual."""
+    """Return the index of the picture (rows, columns, shapes) that fits the strip best.
+
+    Also returns that picture scaled to fit, and the residual.
+    """
     seen = (canvases * clear[..., None]).reshape(strip.size, -1)
     along = strip.ravel() @ seen
     square = np.maximum(np.einsum("pk,pk->k", seen, seen), 1e-6)
@@ -154,7 +167,7 @@ def _closest(canvases: Float32, strip: Float32, clear: Float32) -> tuple[int, Fl
 
 
 def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
-    """Profile of a blurred stroke of unit height against the distance from its axis."""
+    """Return the profile of a blurred stroke of unit height at distances from its axis."""
     scale = np.sqrt(2.0) * sigma_px
     return np.asarray(0.5 * (erf((half_px - distance) / scale) + erf((half_px + distance) / scale)))
 
@@ -163,7 +176,7 @@ def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
 def _strokes(
     strip: tuple[int, int, int], grid: Array, lit_levels: Array, axes: Array, inset: float, tables: Float32
 ) -> Float32:
-    """(rows, columns, shapes) sum of the lit segments' strokes on a strip that begins at row strip[0].
+    """Return the sum (rows, columns, shapes) of the lit segments' strokes on a strip that begins at row strip[0].
 
     Args:
         tables: (N, shapes) stroke profiles, sampled every 1 / STEPS px from the axis.
@@ -201,7 +214,10 @@ def _strokes(
 def _best_dots(
     rest: Float32, seen: Float32, dot: Float32, grid: Array, count: int, first: int, xs: Array, ys: Array
 ) -> tuple[Array, Array]:
-    """(count - 1,) least-squares height of the best dot on a constant background per gap, and 1 where the gap is visible."""
+    """Return the least-squares height (count - 1,) of the best dot on a constant background in each gap.
+
+    Also returns 1 for each gap that is visible.
+    """
     left, pitch, width, top, bottom, slant = grid
     rows, columns = rest.shape
     half = dot.shape[0] // 2

@@ -75,17 +75,17 @@ class DigitGrid:
         return np.array([self.left_px, self.pitch_px, self.width_px, self.top_px, self.bottom_px, self.slant])
 
     def place(self, x: Array, y: Array, cell: Array) -> tuple[Array, Array]:
-        """Pixel coordinates of a place in a cell: x from 0 (left upright) to 1, y from 0 (top) to 1."""
+        """Return pixel coordinates of a place in a cell: x from 0 (left upright) to 1, y from 0 (top) to 1."""
         v = self.top_px + y * (self.bottom_px - self.top_px)
         lean = self.slant * ((self.top_px + self.bottom_px) / 2 - v)
         return self.left_px + cell * self.pitch_px + x * self.width_px + lean, v
 
 
 def find_digit_grids(ink: Float32, seen: Float32, *, most: int = 8, free: float = 0.5) -> list[tuple[float, DigitGrid]]:
-    """(worth, grid) of the most promising grids, best first; an empty list where no ink stands out.
+    """Return the most promising grids with their worth, best first; an empty list if no ink stands out.
 
     Args:
-        ink: (H, W) how much every pixel differs from the background in the way segments do; 0 where nothing is visible.
+        ink: (H, W) how much every pixel differs from the background as segments do; 0 where nothing is visible.
         seen: (H, W) 1 where the display is visible, 0 where something hides it.
         most: maximum number of cells.
         free: largest distance of the grid's middle from the picture's, as a share of the picture's width.
@@ -110,7 +110,7 @@ def find_digit_grids(ink: Float32, seen: Float32, *, most: int = 8, free: float 
 
 
 def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant: float) -> tuple[float, DigitGrid]:
-    """(worth, grid) after continuous refinement of a guess."""
+    """Return worth and grid after continuous refinement of a guess."""
     _, left, pitch, width, top, height, count = (float(value) for value in guess)
     place = np.array([left, pitch, width, top, top + height, 0.0])
     means, shares = segment_means(upright, clear, whole, width, height)
@@ -125,7 +125,7 @@ def _refined(upright: Float32, clear: Float32, whole: bool, guess: Array, slant:
 def segment_means(
     upright: Float32, clear: Float32, whole: bool, width_px: float, height_px: float
 ) -> tuple[Float32, Float32]:
-    """Box means that `digit_grid_fit.grid_worth` looks up; the boxes have the size of a segment of such cells."""
+    """Return the box means that `digit_grid_fit.grid_worth` looks up; a box has the size of a segment of such cells."""
     stroke = round(2 * STROKE * height_px) | 1
     boxes = (
         (round((1 - 2 * INNER) * width_px) | 1, stroke),
@@ -140,7 +140,7 @@ def segment_means(
 
 
 def _evened(ink: Float32) -> Float32:
-    """Ink with dim stretches amplified: segments behind glare or in grazing light are as certain, only weaker."""
+    """Return the ink with dim stretches amplified: behind glare or in grazing light segments are merely weaker."""
     high = column_levels(ink, 0.92)[None]
     reach = max(3, len(ink) // 2) | 1
     wide = cv2.GaussianBlur(cv2.dilate(high, np.ones((1, reach), np.uint8)), (0, 0), reach / 4)
@@ -149,12 +149,12 @@ def _evened(ink: Float32) -> Float32:
 
 
 def _flat_ink(even: Float32) -> Float32:
-    """The part of the ink that is wider than an upright."""
+    """Return the part of the ink that is wider than an upright."""
     return np.asarray(cv2.erode(even, np.ones((1, max(3, len(even) // 9) | 1), np.uint8)), np.float32)
 
 
 def _slant(even: Float32, flat: Float32) -> float:
-    """Tangent of the lean to the right at which the uprights' columns are sharpest."""
+    """Return the tangent of the slant to the right at which the uprights' columns are sharpest."""
     uprights = cv2.subtract(even, cv2.dilate(flat, np.ones((1, max(3, len(even) // 9) | 1), np.uint8)))
     energies = slant_energies(np.asarray(cv2.GaussianBlur(uprights, (3, 1), 0), np.float32), SLANTS)
     k = int(energies.argmax())
@@ -162,7 +162,7 @@ def _slant(even: Float32, flat: Float32) -> float:
 
 
 def _upright(image: Float32, slant: float) -> Float32:
-    """The picture sheared about its middle row so that leaning uprights become vertical."""
+    """Return the picture sheared about its middle row so that slanted uprights become vertical."""
     if slant == 0.0:
         return image
     middle = (len(image) - 1) / 2
@@ -172,7 +172,10 @@ def _upright(image: Float32, slant: float) -> Float32:
 
 
 def _row_pairs(ink: Float32, even: Float32, flat: Float32) -> Array:
-    """(N, 2) top and height of likely digits: three equidistant rows of flat segments, or the rows where ink begins and ends."""
+    """Return top and height (N, 2) of likely digits.
+
+    They are three equidistant rows of flat segments, or the rows where ink begins and ends.
+    """
     rows = len(ink)
     profile = (cv2.GaussianBlur(flat, (1, 3), 0) ** 2).sum(axis=1, dtype=float)
     if profile.max() <= 0:
@@ -193,7 +196,7 @@ def _row_pairs(ink: Float32, even: Float32, flat: Float32) -> Array:
 
 
 def _extent(ink: Float32) -> list[tuple[float, float]]:
-    """Rows of the top and bottom segments' axes, estimated from where the ink begins and ends."""
+    """Return the rows of the top and bottom segments' axes, estimated from where the ink begins and ends."""
     strong = level_at(ink, 0.99)
     profile = np.count_nonzero(ink > 0.45 * strong, axis=1)
     there = np.flatnonzero(profile >= max(2.0, 0.15 * profile.max()))

@@ -22,7 +22,7 @@ from perception.vision.status.digit_grid_worth import (
 
 @inlined
 def _at(image: Float32, u: float, v: float) -> float:
-    """Bilinear interpolation; 0 outside the image."""
+    """Return the bilinear value at (u, v); 0 outside the image."""
     height, width = image.shape
     if u < 0.0 or v < 0.0 or u > width - 1 or v > height - 1:
         return 0.0
@@ -34,11 +34,11 @@ def _at(image: Float32, u: float, v: float) -> float:
 
 @compiled
 def grid_worth(means: Float32, shares: Float32, whole: bool, grid: Array, count: int, lit: Array) -> float:
-    """Worth of a grid (left, pitch, width, top, bottom, slant) of `count` cells.
+    """Return the worth of a grid (left, pitch, width, top, bottom, slant) of `count` cells.
 
     Args:
         means: (3, H, W) around every pixel: mean ink of a flat segment, of an upright one, and mean square in a loop.
-        shares: (2, H, W) visible share of a flat and an upright segment around every pixel; ignored when `whole`.
+        shares: (2, H, W) visible share of a flat and an upright segment around every pixel; ignored if `whole`.
     """
     left, pitch, width, top, bottom, slant = grid
     height = bottom - top

@@ -35,12 +35,12 @@ FLAT = np.array([True, False, False, True, False, False, True])
 
 @inlined
 def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float:
-    """Worth of one cell.
+    """Return the worth of one cell.
 
     Args:
         levels, areas: (7,) mean level and visible area of the segments.
         loops: energy in the cell's loops.
-        lit: (characters, 7) 1 where a segment is lit.
+        lit: (characters, 7) 1 if a segment is lit.
     """
     total = loops
     for s in range(7):
@@ -60,9 +60,9 @@ def cell_worth(levels: Array, areas: Array, loops: float, lit: Array) -> float:
 
 @compiled
 def cell_boxes(top: float, height: float, width: float) -> Array:
-    """(13, 4) boxes (left, top, right, bottom) of a cell whose left upright is at column 0.
+    """Return the boxes (13, 4; left, top, right, bottom) of a cell whose left upright is at column 0.
 
-    The boxes are its seven segments, its two loops, and the areas above and below the left and the right uprights.
+    They are those of its seven segments, its two loops, and the areas above and below the left and the right uprights.
     """
     boxes = np.empty((13, 4))
     s, half = STROKE * height, height / 2
@@ -82,7 +82,7 @@ def cell_boxes(top: float, height: float, width: float) -> Array:
 
 @inlined
 def _at_most(value: float, most: int) -> int:
-    """The nearest integer, clipped to 0 .. `most`."""
+    """Return the nearest integer, clipped to 0 .. `most`."""
     return max(0, min(most, int(value + 0.5)))
 
 
@@ -90,12 +90,12 @@ def _at_most(value: float, most: int) -> int:
 def worth_along(
     ink: Array, seen: Array, whole: bool, place: tuple[float, float, float], stride: int, lit: Array, out: Array
 ) -> None:
-    """Worth of upright cells whose left upright stands at column 0, `stride`, ... of integral images `ink` and `seen`.
+    """Compute the worth of upright cells whose left upright is at column 0, `stride`, ... into `out`.
 
     Args:
-        whole: nothing is hidden, so that areas need not be looked up.
+        ink, seen: integral images.
+        whole: whether nothing is hidden, so that areas need not be looked up.
         place: row of the top segment's axis, height from there to the bottom's, width between the uprights' axes, px.
-        out: receives the result.
     """
     rows, columns = ink.shape[0] - 1, ink.shape[1] - 1
     boxes = cell_boxes(place[0], place[1], place[2])
@@ -132,7 +132,7 @@ def worth_along(
 
 @inlined
 def apartness(gap: float) -> float:
-    """Factor on a grid's worth for its gap (in digit heights).
+    """Return the factor on a grid's worth for its gap (in digit heights).
 
     Neighbouring cells that nearly share their uprights would count the same ink twice.
     """
@@ -143,7 +143,7 @@ def apartness(gap: float) -> float:
 def best_pitch(
     worth: Array, stride: int, pitches: Array, size: tuple[float, float], columns: int, most: int, free: float
 ) -> tuple[float, float, float, int]:
-    """(worth, left column, pitch, cells) of the best grid of at most `most` cells.
+    """Return (worth, left column, pitch, cells) of the best grid of at most `most` cells.
 
     Args:
         worth: worth of cells at places `stride` px apart.
@@ -189,7 +189,9 @@ def best_pitch(
 def guesses(
     ink: Array, seen: Array, whole: bool, rows: Array, widths: Array, pitches: Array, most: int, free: float, lit: Array
 ) -> Array:
-    """(rows x widths, 7) worth, left, pitch, width, top, height, cells of the best grid for every row pair and width.
+    """Return the best grid for every pair of rows and every width: (rows x widths, 7).
+
+    The columns are worth, left, pitch, width, top, height and number of cells.
 
     Args:
         ink, seen: integral images of the upright picture.
@@ -213,9 +215,9 @@ def guesses(
 
 @compiled
 def slant_energies(uprights: Float32, slants: Array) -> Array:
-    """(slants,) sum of squared column sums of the picture sheared by every slant; largest when the uprights are vertical.
+    """Return for every slant the sum of squared column sums of the picture sheared by it, (slants,).
 
-    Only every second row is used.
+    It is largest if the uprights are vertical. Only every second row is used.
     """
     rows, columns = uprights.shape
     middle = (rows - 1) / 2
@@ -236,7 +238,7 @@ def slant_energies(uprights: Float32, slants: Array) -> Array:
 
 @compiled
 def row_scores(profile: Array, heights: Array, step: float) -> Array:
-    """(N, 3) score, top and height of digits with much flat ink in the segments' rows and little in the loops' rows."""
+    """Return score, top and height (N, 3) of digits: much flat ink in the segments' rows and little between them."""
     rows = len(profile)
     found = np.zeros((len(heights) * (int(rows / step) + 1), 3))
     n = 0

@@ -1,8 +1,8 @@
 """Geometric reader of seven-segment displays: ink, grid of digit cells, level of every segment, the likeliest number.
 
-Whatever hides a part (a cable, saturation) is found first, and the segments behind it count as unknown. The numbers
-that remain possible are weighed by their likelihood, by the display's range and by the previous reading; if two are
-about equally likely, the reading is refused.
+Occluders (a cable, saturation) are found first, and the segments behind them count as unknown. The numbers that remain
+possible are weighted by their likelihood, by the display's range and by the previous reading; if two are about equally
+likely, the reading is refused.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ WORK_ROWS = 64  # height in px to which a window is scaled for reading; a stroke
 MOST_CELLS = 8  # for a display whose number of digits is not known
 CELL_COST = 0.008  # share by which a grid with one more cell must explain more ink
 FITS = 12.0  # cap on the log-likelihood (nats) per character: no fit counts as better
-SAME_COMB = 0.05  # in digit heights
-WORTH_WEIGHT = 8.0  # nats per character that a grid with e times the worth may fit worse
-TEMPERATURE = 2.0  # neighbouring segments share their errors, so log-likelihoods count half
+SAME_COMB = 0.05  # in digit heights; grids with smaller differences are the same
+WORTH_WEIGHT = 8.0  # nats per character by which a grid with e times the worth may have a worse fit
+TEMPERATURE = 2.0  # the errors of neighbouring segments are correlated, so log-likelihoods count half
 KNOWN_FREE, FREE = 0.35, 0.5  # largest distance of the digits from the window's middle, over its width
 
-STRAY, STRAY_SCALE = 0.045, 0.003  # half and scale for ink off the strokes, see `stray_ink`
-# Level of the weakest digit relative to the typical one. Of 355 hard drawn displays read correctly all exceed 0.52;
-# of 9 misread ones two are below 0.36: a digit behind an undetected cable, and one in glare.
+STRAY, STRAY_SCALE = 0.045, 0.003  # half and scale of the evidence for ink off the strokes, see `stray_ink`
+# Level of the weakest digit relative to the typical one. Of 355 hard synthetic displays that were read correctly all
+# exceed 0.52; of 9 misread ones two are below 0.36: a digit behind an undetected cable, and one in glare.
 WEAK, WEAK_SCALE = 0.44, 0.025
-LEFT_OUT = 0.7  # factor on the trust where a digit or a sign may stand beside those that were read
+LEFT_OUT = 0.7  # factor on the confidence if there may be a digit or a sign beside those that were read
 SURE = 0.732  # largest probability that a single piece of evidence gives
 
 MOST_NAMED, NAMED = 4, 0.1  # maximum number of candidates in a refusal's text, and the least probability of each
@@ -55,7 +55,9 @@ class Decoded:
 
     Attributes:
         ink, seen: (H, W) ink and visibility of the picture on which the grid lies.
+        listed: the numbers.
         explained: share of the ink that the lit segments explain.
+        grid: the digit cells.
         lit_levels: (cells, 7) level of the best number's lit segments, 0 for the others.
         weakest: level of its weakest digit relative to the typical one.
         fit: mean log-likelihood of its characters.
@@ -74,7 +76,7 @@ class Decoded:
 def read_display(
     patch: Patch, spec: Display, *, digits_taught: bool = True, before: float | None = None
 ) -> PatchReading:
-    """Text and value of a display. `patch` shows its window and the plate round it, origin at the middle.
+    """Return text and value of a display. `patch` shows its window and the plate around it, origin at the middle.
 
     Args:
         digits_taught: if False, the number of digits and decimals is determined from the picture.
@@ -107,12 +109,13 @@ def read_window(
     """Read the text in an upright window of digits.
 
     Args:
-        digits, decimals, dark: what is known; None means that the picture decides.
+        digits, decimals: number of digits and decimals; None: determined from the picture.
+        dark: whether segments are darker than their background; None: determined from the picture.
         limits: smallest and largest possible value.
         hidden: (H, W) True where something occludes the window.
         before: the previous reading.
-        framed: the picture shows a frame all round.
-        bare: the window contains nothing but digits, so that unexplained ink counts against the reading.
+        framed: whether the picture shows a frame on all sides.
+        bare: whether the window contains nothing but digits, so that unexplained ink is evidence against the reading.
     """
     gray, hidden = _working_size(gray, hidden)
     polarities = (True, False) if dark is None else (dark,)
@@ -133,7 +136,10 @@ def read_window(
 
 
 def _as_time(number: PatchReading, found: Decoded, place: int) -> PatchReading:
-    """Reading of a clock, which has text but no value; in doubt unless one or two digits precede its colon and two follow it."""
+    """Return the reading of a clock, which has text but no value.
+
+    It is in doubt unless one or two digits precede its colon and two follow it.
+    """
     characters = found.listed[0].characters
     before, after = characters[:place].strip(), characters[place:]
     text = f"{before}:{after}"
@@ -149,6 +155,7 @@ def _as_time(number: PatchReading, found: Decoded, place: int) -> PatchReading:
 def _decoded(
     gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None, digits: int | None, framed: bool
 ) -> Decoded | None:
+    """Decode the best grid of digits of one polarity; None if there is none."""
     ink, seen = segment_ink(gray, is_dark, hidden)
     ink, lost = without_border(ink, framed=framed)
     if lost is not None:
@@ -166,7 +173,7 @@ def _decoded(
         if decoded is None:
             continue
         most_worth = most_worth or worth
-        # A grid that is too high claims ink by its size that does not exist: its segments' levels disagree.
+        # A grid that is too high claims ink that does not exist, so the levels of its segments differ.
         this = decoded.fit + WORTH_WEIGHT * float(np.log(worth / most_worth))
         if best is None or this > score:
             best, score = decoded, this
@@ -180,10 +187,10 @@ def _same(a: DigitGrid, b: DigitGrid) -> bool:
 
 
 def decode(ink: Float32, seen: Float32, grid: DigitGrid, *, all_cells: bool = False) -> Decoded | None:
-    """Decode the numbers that a grid may show; None when lit and unlit segments do not separate.
+    """Decode the numbers that a grid may show; None if lit and unlit segments do not separate.
 
     Args:
-        all_cells: the grid's last cell is the display's last; otherwise blank cells at its end are not counted.
+        all_cells: whether the grid's last cell is the display's last; otherwise blank cells at its end are not counted.
     """
     segments, shares = segment_levels(ink, seen, grid)
     levels = separate(without_frames(ink, grid, segments), shares, *loop_levels(ink, seen, grid))
@@ -205,7 +212,7 @@ def decode(ink: Float32, seen: Float32, grid: DigitGrid, *, all_cells: bool = Fa
 
 
 def _weakest(ink: Array, lit: NDArray[np.bool_], characters: str) -> float:
-    """Mean level of the visible lit segments of the weakest digit, relative to the typical digit."""
+    """Return the mean level of the visible lit segments of the weakest digit, relative to the typical digit."""
     is_digit = lit.any(axis=1) & np.array([character.isdigit() for character in characters])
     if not is_digit.any():
         return 1.0
@@ -214,7 +221,7 @@ def _weakest(ink: Array, lit: NDArray[np.bool_], characters: str) -> float:
 
 
 def _of_any_length(characters: Array, blank: Array) -> list[Number]:
-    """The likely numbers of a display whose last cells may not belong to it, best first."""
+    """Return the likely numbers of a display whose last cells may not belong to it, best first."""
     tail = np.append(np.cumsum(blank[::-1])[::-1], 0.0)  # log-likelihood that all cells from each one on are blank
     listed = [
         replace(number, log_likelihood=number.log_likelihood + float(tail[count]))
@@ -226,11 +233,12 @@ def _of_any_length(characters: Array, blank: Array) -> list[Number]:
 
 
 def _lit(character: str) -> NDArray[np.bool_]:
+    """Return which segments (7,) a character lights."""
     return LIT[NAMES.index(character)] if character in NAMES else np.zeros(7, bool)
 
 
 def _explained(ink: Float32, grid: DigitGrid, lit_levels: Array) -> float:
-    """Share (0 to 1) of the picture's ink energy, squared level times area, that the lit segments explain."""
+    """Return the share (0 to 1) of the picture's ink energy, squared level times area, that lit segments explain."""
     h = grid.height_px
     area = np.where([True, False, False, True, False, False, True], grid.width_px, h / 2) * 0.08 * h
     total = float((ink.astype(float) ** 2).sum())
@@ -248,7 +256,7 @@ def _answer(
     covered: bool,
     bare: bool,
 ) -> PatchReading:
-    """The likeliest number within the range, or a refusal with its reason."""
+    """Return the likeliest number within the range, or a refusal with its reason."""
     texts = [(_with_point(n.characters, point, decimals), n.log_likelihood) for n in found.listed]
     valued = [(text, value, score) for text, score in texts if (value := _value(text)) is not None]
     if not valued:
@@ -285,24 +293,24 @@ def _answer(
 
 
 def _ranked(numbers: Sequence[tuple[str, float]], share: Array, trust: float) -> tuple[Possible, ...]:
-    """Texts and values with their probabilities, likeliest first; among equally likely ones the one furthest from zero first.
+    """Return texts and values with their probabilities, likeliest first.
 
-    A cable often makes several numbers equally likely. A caller that acts on the first of them then errs towards the
-    alarm.
+    Of equally likely ones the value farthest from zero is first: a cable often makes several numbers equally likely,
+    and a caller that uses the first one then errs on the side of an alarm.
     """
     order = sorted(range(len(numbers)), key=lambda i: (-round(float(share[i]), 6), -abs(numbers[i][1])))
     return tuple(Possible(text=numbers[i][0], value=numbers[i][1], probability=float(share[i]) * trust) for i in order)
 
 
 def _expected(value: float, before: float | None, span: float) -> float:
-    """Log-probability of a value given the previous one: most readings change little, a few jump to any value."""
+    """Return the log-probability of a value given the previous one; most readings change little."""
     if before is None or not np.isfinite(span) or span <= 0:
         return 0.0
     return float(np.log(0.05 + 0.95 * np.exp(-abs(value - before) / (0.05 * span))))
 
 
 def _with_point(characters: str, point: DecimalPoint | None, decimals: int | None) -> str:
-    """Text with its decimal point, from the panel file or else from the dot that is lit in a gap."""
+    """Return the text with its decimal point, at the place in the panel file or else at the dot found in a gap."""
     place = (len(characters) - decimals if decimals else None) if point is None else point.place
     if place is not None and place >= len(characters):
         place = None  # place for a number with fewer digits
@@ -313,6 +321,7 @@ def _with_point(characters: str, point: DecimalPoint | None, decimals: int | Non
 
 
 def _value(text: str) -> float | None:
+    """Return the number of a text; None if it is none."""
     try:
         return float(text)
     except ValueError:
@@ -320,7 +329,7 @@ def _value(text: str) -> float | None:
 
 
 def _window(patch: Patch, spec: Display) -> tuple[slice, slice]:
-    """Rows and columns of the patch that show the window without its frame."""
+    """Return the rows and columns of the patch that show the window without its frame."""
     margin = MARGIN * min(spec.width_m, spec.height_m)
     w, h = spec.width_m / 2 - margin, spec.height_m / 2 - margin
     u, v = patch.pixel_of(np.array([-w, w]), np.array([h, -h]), 0.0)
@@ -328,6 +337,7 @@ def _window(patch: Patch, spec: Display) -> tuple[slice, slice]:
 
 
 def _working_size(gray: Image, hidden: NDArray[np.bool_] | None) -> tuple[Image, NDArray[np.bool_] | None]:
+    """Return the window and its mask, reduced to `WORK_ROWS` rows if it is larger."""
     rows, columns = gray.shape
     if rows <= 1.15 * WORK_ROWS:
         return gray, hidden
@@ -339,10 +349,10 @@ def _working_size(gray: Image, hidden: NDArray[np.bool_] | None) -> tuple[Image,
 
 
 class _DisplayReader(Reader[Display]):
-    """Reader that passes on the number of digits taught and the previous reading."""
+    """Reader that uses the number of digits taught and the previous reading."""
 
     def status(self, patch: Patch, spec: Display, hints: Hints) -> PatchReading:
-        """Text and value of a display."""
+        """Return text and value of a display."""
         return read_display(patch, spec, digits_taught=hints.digits_taught, before=hints.before)
 
 

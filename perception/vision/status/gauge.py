@@ -13,7 +13,7 @@ from perception.vision.status.reader import Reader
 
 # Share of the radius over which every gauge pointer has ink and there are no numerals
 POINTER_FROM, POINTER_TO = 0.25, 0.60
-FINE_TO = 0.48  # numerals begin at half of the radius: blurred, they pull nearby pointers by up to 6 degrees
+FINE_TO = 0.48  # numerals begin at half of the radius; when blurred, they shift a nearby pointer by up to 6 degrees
 STOP_RAD = np.deg2rad(6.0)  # a pointer rests at most this far beyond its scale
 LEAST_SEEN = 0.25  # share of the face that must be visible
 MOST_SIGMA_RAD = 0.03
@@ -22,13 +22,13 @@ MOST_SIGMA_RAD = 0.03
 RIVAL = (
     0.50,
     0.03,
-)  # of 330 pointers on drawn panels read right .98 have less than 0.45; half of those read wrong have more than 0.6
-SIGMA_RAD = (0.026, 0.003)  # .99 of them have less than 0.026
+)  # of 330 synthetic pointers read correctly 98 % have less than 0.45; half of the misread ones have more than 0.6
+SIGMA_RAD = (0.026, 0.003)  # 99 % of the pointers read correctly have less than 0.026
 LEAST_SHOWN = 0.52  # visible share of the pointer's radii: beside a cable, a numeral alone could reach less than this
 
 
 def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
-    """Value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
+    """Return the value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
     R = spec.radius_m
     seen = _seen(patch, R)
     fit = find_pointer(
@@ -46,7 +46,7 @@ def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
 
 
 def no_pointer(seen: float, unit: str) -> PatchReading:
-    """Refusal for a face without a pointer, worded by the share of the face that is visible."""
+    """Return the refusal for a face without a pointer; the reason depends on the visible share of the face."""
     if seen < LEAST_SEEN:
         return refused("the face cannot be seen (glare, shadow or cover): change the angle or the light", unit=unit)
     return refused("no pointer stands out on the face: come closer or add light", unit=unit)
@@ -55,7 +55,7 @@ def no_pointer(seen: float, unit: str) -> PatchReading:
 def status_of_pointer(
     fit: PointerFit, scale: Scale, seen: float, *, rival: tuple[float, float] = RIVAL, sigma_rad: tuple[float, float] = SIGMA_RAD
 ) -> PatchReading:  # fmt: skip
-    """Value and confidence of a pointer on a scale, or a refusal when the pointer is off the scale.
+    """Return value and confidence of a pointer on a scale, or a refusal if the pointer is off the scale.
 
     Args:
         rival, sigma_rad: see `pointer_confidence`.
@@ -87,7 +87,7 @@ def status_of_pointer(
 def pointer_confidence(
     fit: PointerFit, seen: float, *, rival: tuple[float, float], sigma_rad: tuple[float, float]
 ) -> float:
-    """Confidence of a pointer from contrast, rival, support, straightness and visibility.
+    """Return the confidence of a pointer from contrast, rival, support, straightness and visibility.
 
     A dark pointer is visible on a saturated face as well; parts that saturation hides are missing from its support.
 
@@ -111,6 +111,7 @@ def pointer_confidence(
 
 
 def _seen(patch: Patch, radius_m: float) -> float:
+    """Return the visible share of the face."""
     a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     r = np.array([0.2, 0.4, 0.6, 0.75])[:, None] * radius_m
     return patch.seen(r * np.sin(a), r * np.cos(a))

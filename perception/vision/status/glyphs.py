@@ -32,7 +32,7 @@ LEAST_SEEN = 0.19  # visible share of a segment below which it is ignored
 SPREAD = 0.16  # standard deviation of a lit segment's level over that level: uneven light, blur, pixels
 LEAK = 0.15  # the same for an unlit segment, which receives blur from its lit neighbours
 CELL_SPREAD = 0.4  # standard deviation of the logarithm of a cell's lit level over the display's
-MOST_LOSS = 9.0  # largest penalty (nats) per segment: larger deviations are not due to noise
+MOST_LOSS = 9.0  # largest penalty (nats) per segment, because larger deviations are not due to noise
 # Faintly visible unlit segments: standard deviation of their level over the lit one, and its maximum
 GHOST, MOST_GHOST = 0.12, 0.3
 CLOSE = 7.0  # nats within which further characters of a cell are listed
@@ -40,7 +40,7 @@ MOST_LISTED = 300
 
 
 def lit_segments(text: str) -> int:
-    """Number of segments that a text lights."""
+    """Return the number of segments that a text lights."""
     return sum(int(LIT[NAMES.index(character)].sum()) for character in text if character in NAMES)
 
 
@@ -70,7 +70,7 @@ class Number:
 
 
 def separate(ink: Array, seen: Array, loops: Array, loop_noise: Array) -> Levels | None:
-    """Separate lit from unlit levels (N. Otsu, IEEE SMC 9(1), 1979); None where they do not separate.
+    """Separate lit from unlit levels (N. Otsu, IEEE SMC 9(1), 1979); None if they do not separate.
 
     Args:
         ink, seen: (cells, 7) level and visible share of every segment.
@@ -97,7 +97,7 @@ def separate(ink: Array, seen: Array, loops: Array, loop_noise: Array) -> Levels
 
 
 def likelihoods(levels: Levels) -> tuple[Array, Array]:
-    """(cells, characters) and (cells,) log-likelihood of every character, and of a blank cell."""
+    """Return the log-likelihoods of every character (cells, characters), and of a blank cell (cells,)."""
     weight = np.where(levels.seen >= LEAST_SEEN, np.minimum(1.0, levels.seen * 1.5), 0.0)  # (cells, 7)
     w, ink = weight[:, None, :], levels.ink[:, None, :]
     there = w * LIT
@@ -116,7 +116,10 @@ def likelihoods(levels: Levels) -> tuple[Array, Array]:
 
 
 def _blank(levels: Levels, weight: Array) -> Array:
-    """(cells,) log-likelihood of a blank cell: its segments have similar levels that hardly exceed those of its loops."""
+    """Return the log-likelihood (cells,) of a blank cell.
+
+    Its segments have similar levels, which hardly exceed those of its loops.
+    """
     unlit, noise = levels.unlit[:, None], levels.noise[:, None]
     ghost = np.sort(np.where(weight > 0, levels.ink, unlit), axis=1)[:, 3:4]  # the median
     ghost = np.clip(ghost, unlit, unlit + MOST_GHOST * levels.lit)
@@ -126,7 +129,7 @@ def _blank(levels: Levels, weight: Array) -> Array:
 
 
 def numbers(characters: Array, blank: Array) -> list[Number]:
-    """List every likely number, best first: blanks, an optional sign (and blanks after it), then digits.
+    """Return every likely number, best first: blanks, an optional sign (and blanks after it), then digits.
 
     Args:
         characters, blank: from `likelihoods`.
@@ -155,7 +158,7 @@ def numbers(characters: Array, blank: Array) -> list[Number]:
 
 
 def _digits(characters: Array) -> Array:
-    """(cells, 10) log-likelihood of every digit, using its best form."""
+    """Return the log-likelihood (cells, 10) of every digit in its best form."""
     digits = characters[:, :10].copy()
     for digit, k in OTHER_FORMS:
         np.maximum(digits[:, digit], characters[:, k], out=digits[:, digit])
@@ -163,7 +166,7 @@ def _digits(characters: Array) -> Array:
 
 
 def _alternatives(digits: Array) -> list[tuple[str, float]]:
-    """(text, nats below the best) of the likely strings of digits."""
+    """Return the likely strings of digits, each with its difference in nats to the best."""
     losses = digits.max(axis=1, keepdims=True) - digits
     close = [
         sorted(((str(k), loss) for k, loss in enumerate(row) if loss <= CLOSE), key=lambda c: c[1])

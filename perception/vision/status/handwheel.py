@@ -1,4 +1,4 @@
-"""Reader of handwheels: the phase of all spokes gives the angle within one spacing, the marked spoke selects the spacing."""
+"""Reader of handwheels: the phase of all spokes gives the angle within one spacing, the marked spoke its spacing."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from perception.vision.status.reader import Reader
 
 STEPS = 720
 GLARE = 0.25  # share of the radius; marks are smaller
-RIVAL_STEPS = 30  # 15 degrees: further off than any part of the same spoke
-# Of 330 drawn wheels read correctly 97 % have less; of those misread with a confidence above 0.85 all exceed 0.61.
+RIVAL_STEPS = 30  # 15 degrees: farther away than any part of the same spoke
+# Of 330 synthetic wheels that were read correctly 97 % have less; of those misread with a confidence above 0.85 all
+# exceed 0.61.
 RIVAL_SHARE = 0.55
 # Share of the spokes' contrast by which a marked spoke differs from gaps and other spokes. Of 405 wheels read
 # correctly four have less; of seven misread ones four, whose mark a cable or glare hides: the selected spoke may be
@@ -34,7 +35,10 @@ BESIDE = 28  # steps: 14 degrees, outside a spoke and its mark
 
 
 def read_handwheel(patch: Patch, spec: Handwheel) -> PatchReading:
-    """Angle (rad, clockwise from straight up, -pi..pi) of the marked spoke. `patch` shows the wheel's plane."""
+    """Return the angle of the marked spoke, rad clockwise from straight up, -pi to pi.
+
+    `patch` shows the wheel's plane.
+    """
     R, n = spec.radius_m + spec.rim_m, spec.spokes
     angles = 2 * np.pi * np.arange(STEPS) / STEPS
     spoke = unroll(patch, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles, None)
@@ -84,10 +88,10 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> PatchReading:
 
 
 def _gaps(spoke: Array | NDArray[np.float32], n: int) -> Array:
-    """(radii, STEPS) background between the spokes at every radius: the median over one spacing about every direction.
+    """Return the background (radii, STEPS) between the spokes at every radius.
 
-    Under uneven light, the gap on the far side differs from the whole turn's median as much as a spoke does. That
-    median replaces NaN.
+    It is the median over one spacing around every direction. The median over the whole turn would be wrong under uneven
+    light, where the gap on the far side differs from it as much as a spoke does; it only replaces NaN.
     """
     coarse = spoke[:, ::EVERY]
     coarse = np.where(np.isnan(coarse), _median(spoke, axis=1)[:, None], coarse)
@@ -98,17 +102,19 @@ def _gaps(spoke: Array | NDArray[np.float32], n: int) -> Array:
 
 
 def _median(values: Array | NDArray[np.float32], *, axis: int) -> Array:
-    """Median of the known values; much faster than numpy's `nanmedian`."""
+    """Return the median of the known values; much faster than numpy's `nanmedian`."""
     return np.asarray((np.nanmedian if np.isnan(values).any() else np.median)(values, axis=axis), float)
 
 
 def _smooth(values: Array, width: int) -> Array:
+    """Return a periodic profile smoothed over `width` samples."""
     kernel = np.hanning(width + 2)[1:-1]
     padded = np.concatenate([values[-width:], values, values[:width]])
     return np.convolve(padded, kernel / kernel.sum(), "same")[width:-width]
 
 
 def _fold(ink: Array, n: int) -> Array:
+    """Return the mean over all spokes but the strongest, for every phase within one spacing."""
     period = STEPS / n
     steps = np.arange(int(period))
     stacked = np.array([np.interp(steps + k * period, np.arange(STEPS), ink, period=STEPS) for k in range(n)])
@@ -116,7 +122,7 @@ def _fold(ink: Array, n: int) -> Array:
 
 
 def _rival(folded: Array, top: int) -> float:
-    """Score of the best clearly different phase relative to that of the phase at `top`."""
+    """Return the score of the best clearly different phase relative to that of the phase at `top`."""
     n = len(folded)
     apart = np.abs((np.arange(n) - top + n // 2) % n - n // 2) > RIVAL_STEPS
     ground = float(np.median(folded))
@@ -124,7 +130,7 @@ def _rival(folded: Array, top: int) -> float:
 
 
 def _peak(folded: Array, top: int) -> float:
-    """Centre of mass of the peak, because spokes are wide and flat."""
+    """Return the centre of mass of the peak, because spokes are wide and flat."""
     half = len(folded) // 4
     offsets = np.arange(-half, half + 1)
     values = folded[(top + offsets) % len(folded)]
@@ -133,11 +139,11 @@ def _peak(folded: Array, top: int) -> float:
 
 
 def _centred(ink: Array, phase: float, n: int) -> float:
-    """Phase (steps) as the mean over all spokes, provided that every spoke shows and they lie as on a complete wheel.
+    """Return the phase (steps) as the mean over all spokes, if all are visible and lie as on a complete wheel.
 
-    When the wheel is displaced in the patch, some spokes appear turned one way and others the other way, with mean
-    zero; the fold only has what most of them share. 1 mm is 3 degrees at the spokes' middle. A cable or a shadow moves
-    only one spoke, or moves it further.
+    If the wheel is displaced in the patch, some spokes appear rotated one way and others the other way, with mean zero;
+    the fold only has what most of them share. A shift of 1 mm is 3 degrees at the spokes' middle. A cable or a shadow
+    shifts only one spoke, or shifts it farther.
     """
     period = STEPS / n
     half = round(period / 4)
@@ -158,14 +164,15 @@ def _centred(ink: Array, phase: float, n: int) -> float:
 
 
 def _at(mark: NDArray[np.float32], angle: float) -> Array:
+    """Return the gray of a spoke's strip relative to both sides, per radius."""
     step = round(angle / (2 * np.pi) * STEPS)
     near = mark[:, (step + np.arange(-6, 7)) % STEPS].mean(axis=1)
     beside = [mark[:, (step + side * BESIDE + np.arange(-4, 5)) % STEPS].mean(axis=1) for side in (-1, 1)]
-    return np.asarray(near - (beside[0] + beside[1]) / 2, float)  # glare is on both sides, a mark is not
+    return np.asarray(near - (beside[0] + beside[1]) / 2, float)  # glare is on both sides as well, a mark is not
 
 
 def _mark_evidence(profile: Array, k: int) -> float:
-    """Largest difference (gray levels) of spoke `k` from the others that holds at two neighbouring radii."""
+    """Return the largest difference (gray levels) of spoke `k` from the others that holds at two neighbouring radii."""
     rest = np.delete(profile, k, axis=0)
     known = np.isfinite(rest).any(axis=0) & np.isfinite(profile[k])
     others = _median(np.where(known, rest, 0.0), axis=0)
@@ -174,7 +181,10 @@ def _mark_evidence(profile: Array, k: int) -> float:
 
 
 def _beyond(profile: Array, k: int) -> float:
-    """Largest amount (gray levels) by which spoke `k` lies outside gaps and other spokes at two neighbouring radii."""
+    """Return by how much (gray levels) spoke `k` is outside the range of gaps and other spokes.
+
+    It is the largest amount that holds at two neighbouring radii.
+    """
     rest = np.nan_to_num(np.delete(profile, k, axis=0))
     over, under = profile[k] - rest.max(axis=0, initial=0.0), rest.min(axis=0, initial=0.0) - profile[k]
     beyond = np.nan_to_num(np.maximum(over, under)).clip(min=0.0)
@@ -182,13 +192,13 @@ def _beyond(profile: Array, k: int) -> float:
 
 
 def _at_most(mask: NDArray[np.float32], angle: float) -> Array:
-    """Largest value at a spoke and on both sides of it, at the places that `_at` samples."""
+    """Return the largest value at a spoke and on both sides of it, at the places that `_at` samples."""
     step = round(angle / (2 * np.pi) * STEPS)
     return np.asarray(mask[:, (step + np.arange(-BESIDE - 4, BESIDE + 5)) % STEPS].max(axis=1), float)
 
 
 def _glare(patch: Patch, radius_m: float) -> Patch:
-    """Patch that is 1 where glare hides the wheel: saturated areas that are wider than any mark."""
+    """Return a patch that is 1 where glare hides the wheel: saturated areas that are wider than any mark."""
     white = (patch.gray >= WHITE_LEVEL).astype(np.uint8)
     if not white.any():
         return replace(patch, gray=white)

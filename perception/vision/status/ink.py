@@ -1,4 +1,4 @@
-"""Ink of a display: how much every pixel differs from the background in the way segments do, and where it is visible."""
+"""Ink of a display: how much every pixel differs from the background as segments do, and where it is visible."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hal.arrays import Image
 from hal.jit import compiled
 from perception.vision.status.digit_grid_worth import Float32
 
-HEADROOM = 0.5  # share of a lit segment's level: with less room below white, the pixel counts as unknown
+HEADROOM = 0.5  # share of a lit segment's level; with less room below white the pixel counts as unknown
 SHOWS = 0.3  # share of a lit segment's level that exceeds noise
 KERNEL = 0.30  # share of the picture's height: wider than any stroke, narrower than the variation of light
 SATURATED = 252
@@ -27,16 +27,16 @@ WIDEST_STROKE = 0.17  # share of the picture's height
 
 
 def segment_ink(gray: Image, is_dark: bool, hidden: NDArray[np.bool_] | None = None) -> tuple[Float32, Float32]:
-    """(ink, seen), both (H, W): hat transform with a kernel wider than a segment's stroke, 0 at the typical background.
+    """Return ink and visibility (H, W): a hat transform with a kernel wider than a segment's stroke.
 
-    White-hat for glowing segments and black-hat for dark ones, so that gradients and glare vanish; computed on light
-    instead of gray levels where glare makes the background uneven. Hidden and saturated pixels count as background and
-    as not visible.
+    The ink is 0 at the typical background. White-hat for glowing segments and black-hat for dark ones remove gradients
+    and glare; they are computed on light instead of gray levels if glare makes the background uneven. Hidden and
+    saturated pixels count as background and as not visible.
     """
     smooth = np.asarray(cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * gray.shape[0])), np.uint8)
     lost = _drowned(gray, is_dark) if hidden is None else hidden | _drowned(gray, is_dark)
     white = SATURATED
-    covered = lost if is_dark else hidden  # glare is its own background: if it were filled, its flanks would stand out
+    covered = lost if is_dark else hidden  # glare stays as its own background: if filled, its edges would stand out
     ink, background = _hat(smooth, is_dark, covered)
     if _is_uneven(background, lost):
         ink, background = _hat(LIGHT[smooth], is_dark, covered)
@@ -57,7 +57,10 @@ def _is_uneven(background: Image, lost: NDArray[np.bool_]) -> bool:
 
 
 def _hat(smooth: Image, is_dark: bool, covered: NDArray[np.bool_] | None) -> tuple[Float32, Image]:
-    """(H, W) contrast of strokes, and the background relative to which it is measured; covered pixels are background."""
+    """Return the contrast (H, W) of strokes, and the background to which it is relative.
+
+    Covered pixels are background.
+    """
     size = max(5, round(KERNEL * smooth.shape[0])) | 1
     kernel = np.ones((size, size), np.uint8)
     filled = cv2.bitwise_not(smooth) if is_dark else smooth
@@ -69,7 +72,7 @@ def _hat(smooth: Image, is_dark: bool, covered: NDArray[np.bool_] | None) -> tup
 
 
 def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
-    """Mask of the glare that hides segments: saturated areas wider than a stroke, because a stroke may itself saturate.
+    """Return a mask of the glare that hides segments: saturated areas wider than a stroke, which may itself saturate.
 
     Dark segments on a saturated background remain visible, and so does their absence beside others.
     """
@@ -82,7 +85,10 @@ def _drowned(gray: Image, is_dark: bool) -> NDArray[np.bool_]:
 
 
 def _near_strokes(gray: Image) -> NDArray[np.bool_]:
-    """Mask of the places where a dark stroke would be visible because a nearby one is; light varies little over that distance."""
+    """Return a mask of the places near a visible dark stroke, where another would be visible, too.
+
+    Light varies little over that distance.
+    """
     rows = gray.shape[0]
     size = max(5, round(KERNEL * rows)) | 1
     smooth = cv2.GaussianBlur(gray, (0, 0), max(0.6, 0.012 * rows))
@@ -93,17 +99,17 @@ def _near_strokes(gray: Image) -> NDArray[np.bool_]:
 
 
 def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDArray[np.bool_] | None]:
-    """Remove ink that is connected with the picture's border over a long stretch, because it is a frame and not a segment.
+    """Remove ink that is connected with the picture's border over a long stretch: a frame and not a segment.
 
-    Ink of that frame that reaches in among the digits may hide them or be removed with them, so it is returned as
-    unknown.
+    Parts of the frame between the digits may hide them or include them, so they are returned as unknown.
 
     Args:
-        framed: a frame certainly surrounds the digits, so that anything touching the border is not a digit. It is
+        framed: whether a frame certainly surrounds the digits, so that anything touching the border is not a digit. It
+        is
             removed level by level, because a frame may have far more contrast than the digits.
 
     Returns:
-        (H, W) the remaining ink, and a mask of what may hide digits. The mask is None where nothing does, and where the
+        the remaining ink (H, W), and a mask of what may hide digits. The mask is None if nothing does, and if the
         removed ink is certainly a frame.
     """
     lost: NDArray[np.bool_] | None = None
@@ -118,9 +124,9 @@ def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDAr
 
 
 def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
-    """(H, W) ink above a level that is connected with the border, slightly dilated, and its parts that reach deep inside.
+    """Return the ink (H, W) above a level that is connected with the border, slightly dilated.
 
-    None where no ink reaches deep into the picture.
+    Also returns its parts that reach deep inside. None if no ink reaches deep into the picture.
     """
     mask = (ink > least).astype(np.uint8)
     if not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()):
@@ -143,12 +149,13 @@ def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.boo
 
 
 def level_at(ink: Float32, share: float) -> float:
-    """Quantile of the ink (0 to 255), to one gray level: the level that this share of it does not exceed."""
+    """Return a quantile of the ink (0 to 255), to one gray level: the level that this share of it does not exceed."""
     return _level_at(ink.ravel(), share)
 
 
 @compiled
 def _level_at(ink: Float32, share: float) -> float:
+    """Compute `level_at`."""
     counts = np.zeros(256, np.int64)
     for value in ink:
         counts[min(255, int(value))] += 1
@@ -161,7 +168,7 @@ def _level_at(ink: Float32, share: float) -> float:
 
 @compiled
 def column_levels(ink: Float32, share: float) -> Float32:
-    """(W,) quantile of every column of the ink (0 to 255): the level that this share of the column does not exceed."""
+    """Return a quantile (W,) of every column of the ink (0 to 255): the level that this share of it does not exceed."""
     rows, columns = ink.shape
     out = np.zeros(columns, np.float32)
     counts = np.zeros(256, np.int64)

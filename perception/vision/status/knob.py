@@ -14,13 +14,13 @@ from perception.vision.status.reader import Reader
 MARK_FROM, MARK_TO = 0.35, 0.80  # share of the knob's radius over which the mark runs
 MARK_HALF_WIDTH = 0.06
 STEP_RAD = np.deg2rad(1.0)
-BEYOND_RAD = np.deg2rad(6.0)  # a mark rests at most this far beyond its scale
-RIVAL_RAD = np.deg2rad(25.0)  # anything further off is a different mark
+BEYOND_RAD = np.deg2rad(6.0)  # largest angle of a mark beyond its scale
+RIVAL_RAD = np.deg2rad(25.0)  # anything farther away is a different mark
 SIGMA_RAD = np.deg2rad(0.8)
 
 
 def read_knob(patch: Patch, spec: Knob) -> PatchReading:
-    """Value of a knob. `patch` shows the plane of the knob's face."""
+    """Return the value of a knob. `patch` shows the plane of the knob's face."""
     R, scale = spec.radius_m, spec.scale
     low, high = sorted((scale.at_min, scale.at_max))
     angles = np.arange(low - BEYOND_RAD, high + BEYOND_RAD, STEP_RAD)

@@ -13,16 +13,18 @@ from perception.vision.reading import PatchReading, gated, refused
 from perception.vision.status.occluder_bands import cables_across
 from perception.vision.status.reader import LAMP_MARGIN, Reader
 
-CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)  # in radii
-RING_PLACES, LEAST_SEEN = 108, 0.3  # samples per ring; share that must be visible
+# Radii of the rings on the lens, near its edge, and on the plate, over the lamp's radius.
+CORE, RIM, PLATE = (0.0, 0.15, 0.3), (0.5, 0.6, 0.7), (1.45, 1.6, 1.75)
+RING_PLACES, LEAST_SEEN = 108, 0.3  # samples per ring; share of them that must be visible
 CLEAR_OF_BEZEL = 1.4  # in radii
 LIT_RATIO = 0.95  # between an unlit lens (0.2 to 0.9 of the plate) and a lit one (above 1.1)
 MOST_WHITE = 0.2  # share of the surrounding plate
-FLAT_RATIO = 1.1  # middle over rim: of unlit lenses .95 have less than 1.1, of lit ones that do not saturate .97 more
+# Middle over rim: 95 % of unlit lenses have less than 1.1, 97 % of lit ones that do not saturate have more.
+FLAT_RATIO = 1.1
 
 
 def read_lamp(patch: Patch, spec: Lamp) -> PatchReading:
-    """State of a lamp. `patch` shows the plate plane or the lens."""
+    """Return the state of a lamp. `patch` shows the plate plane or the lens."""
     light = patch.gray if patch.colour is None else patch.colour.max(axis=2)
     beyond_m = CLEAR_OF_BEZEL * spec.radius_m
     hidden = cables_across(patch, radius_m=beyond_m, own_rad=np.empty(0))
@@ -53,7 +55,7 @@ def read_lamp(patch: Patch, spec: Lamp) -> PatchReading:
 def _ring(
     patch: Patch, light: Image, radius_m: float, radii: tuple[float, ...], hidden: NDArray[np.bool_] | None
 ) -> Array:
-    """(N,) brightness at the unoccluded places of rings about the middle."""
+    """Return the brightness (N,) at the unoccluded places of rings around the middle."""
     a = np.linspace(0, 2 * np.pi, RING_PLACES // len(radii), endpoint=False)
     r = np.array(radii)[:, None] * radius_m
     u, v = patch.pixel_of(r * np.sin(a), r * np.cos(a))

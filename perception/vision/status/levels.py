@@ -21,17 +21,23 @@ LOOP_Y = np.array([0.2, 0.25, 0.3, 0.7, 0.75, 0.8])
 
 
 def segment_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array, Array]:
-    """(cells, 7) level of every segment (the median along its axis of the maximum across its stroke), and its visible share."""
+    """Return level and visible share (cells, 7) of every segment.
+
+    The level is the median along the segment's axis of the maximum across its stroke.
+    """
     return _segments(ink, seen, grid.numbers, grid.count, AXES)
 
 
 def loop_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array, Array]:
-    """(cells,) mean and standard deviation of the ink inside the loops of every cell, where there is no segment; NaN if hidden."""
+    """Return mean and standard deviation (cells,) of the ink inside the loops of every cell; NaN if hidden.
+
+    There is no segment inside a loop.
+    """
     return _loops(ink, seen, grid.numbers, grid.count, LOOP_X, LOOP_Y)
 
 
 def without_frames(ink: Float32, grid: DigitGrid, levels: Array) -> Array:
-    """(cells, 7) levels without the uprights that continue above and below the digit, because these are a frame's sides."""
+    """Return the levels (cells, 7) without uprights that continue above and below the digit, as a frame's sides do."""
     beyond = _beyond(ink, grid.numbers, grid.count)
     out = levels.copy()
     for side, (upper, lower) in enumerate(((5, 4), (1, 2))):
@@ -63,7 +69,7 @@ def with_hidden_ends(seen: Float32, grid: DigitGrid, most: int) -> DigitGrid:
 
 
 def _fits(cell: DigitGrid, columns: int) -> bool:
-    """Return whether a further cell lies inside the picture with its strokes."""
+    """Return whether a further cell with its strokes lies inside the picture."""
     u, _ = cell.place(np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0]), np.zeros(4))
     half = STROKE * cell.height_px
     return bool(u.min() >= half and u.max() <= columns - 1 - half)
@@ -71,7 +77,7 @@ def _fits(cell: DigitGrid, columns: int) -> bool:
 
 @inlined
 def _value(image: Float32, u: float, v: float) -> float:
-    """Bilinear interpolation; 0 outside, with a linear transition over one pixel at the border."""
+    """Return the bilinear value at (u, v); 0 outside, with a linear transition over one pixel at the border."""
     height, width = image.shape
     if u <= -1.0 or v <= -1.0 or u >= width or v >= height:
         return 0.0
@@ -87,6 +93,7 @@ def _value(image: Float32, u: float, v: float) -> float:
 
 @compiled
 def _segments(ink: Float32, seen: Float32, grid: Array, count: int, axes: Array) -> tuple[Array, Array]:
+    """Compute `segment_levels`; `axes` are the ends of the segments' axes in a cell."""
     left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     levels, shares = np.zeros((count, 7)), np.zeros((count, 7))
@@ -119,6 +126,7 @@ def _segments(ink: Float32, seen: Float32, grid: Array, count: int, axes: Array)
 
 @compiled
 def _loops(ink: Float32, seen: Float32, grid: Array, count: int, xs: Array, ys: Array) -> tuple[Array, Array]:
+    """Compute `loop_levels` from samples at the places `xs` x `ys` in a cell."""
     left, pitch, width, top, bottom, slant = grid
     means, spreads = np.full(count, np.nan), np.full(count, np.nan)
     for cell in range(count):
@@ -141,7 +149,10 @@ def _loops(ink: Float32, seen: Float32, grid: Array, count: int, xs: Array, ys: 
 
 @compiled
 def _beyond(ink: Float32, grid: Array, count: int) -> Array:
-    """(cells, 2) least ink over the places above and below the left and right uprights, each the maximum across the stroke."""
+    """Return the least ink (cells, 2) over the places above and below the left and right uprights.
+
+    Each place counts with the maximum across the stroke.
+    """
     left, pitch, width, top, bottom, slant = grid
     height = bottom - top
     found = np.zeros((count, 2))

@@ -26,15 +26,15 @@ BEYOND = (1.12, 1.30)  # in lengths: clear of the tip, and still in the patch
 ASIDE = (-0.5, 0.0, 0.5)  # in widths: places where the bar may continue
 GOES_ON = 2.0  # weight of the contrast beyond the tip; a flange or a pipe's end sometimes lies there
 SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
-BETWEEN_RAD = 0.16  # a quarter-turn valve that is 9 degrees off its stop is neither open nor closed
+BETWEEN_RAD = 0.16  # a quarter-turn valve 9 degrees away from its stop is neither open nor closed
 ANGLE_SIGMA_RAD = 0.02
 LIGHT_SIGMA, MIDDLE_GRAY = 1.4, 128.0  # of the bar's width; gray levels
-MOST_IN_GLARE = 0.79  # of about thirty second-pass answers one was wrong, so their confidence stays below an answer's
-WOBBLE_RAD = np.deg2rad(np.linspace(-10, 10, 9))
+MOST_IN_GLARE = 0.79  # largest confidence of the second pass, of whose answers about one in thirty was wrong
+WOBBLE_RAD = np.deg2rad(np.linspace(-10, 10, 9))  # tried deviations from the nominal angles
 
 
 def read_lever(patch: Patch, spec: Lever) -> PatchReading:
-    """State of a lever valve. `patch` shows the plane of the bar; several states may share a name.
+    """Return the state of a lever valve. `patch` shows the plane of the bar; several states may share a name.
 
     Beside glare one side of the bar has little contrast. If no bar stands out, the patch is read again without its
     gradients.
@@ -50,7 +50,7 @@ def read_lever(patch: Patch, spec: Lever) -> PatchReading:
             return status
         status = replace(again, confidence=min(again.confidence, MOST_IN_GLARE))
     angle = _bar_angle(patch, spec, nominal, hidden)
-    # Seen obliquely, the bar's walls turn its image by up to the lean of its height over its length.
+    # In an oblique view the bar's walls rotate its image by up to the displacement of its top over its length.
     lean_m = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.height_m / patch.px_per_m
     if abs(angle - nominal) <= BETWEEN_RAD + lean_m / spec.length_m:
         return replace(status, value=angle, unit="rad", uncertainty=ANGLE_SIGMA_RAD)
@@ -61,7 +61,7 @@ def read_lever(patch: Patch, spec: Lever) -> PatchReading:
 
 
 def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[PatchReading, float, NDArray[np.bool_] | None]:
-    """The state whose bar has the most contrast, its direction, and the mask of occluders."""
+    """Return the state whose bar has the most contrast, its direction, and the mask of occluders."""
     L = spec.length_m
     angles = np.array([state.angle_rad for state in spec.states])
     tried = (angles[:, None] + WOBBLE_RAD).ravel()
@@ -76,7 +76,7 @@ def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[PatchReading, fl
 
 
 def _flattened(patch: Patch, spec: Lever) -> Patch:
-    """The patch without variations wider than the bar, about middle gray."""
+    """Return the patch without variations wider than the bar, around middle gray."""
     gray = patch.gray.astype(np.float32)
     light = cv2.GaussianBlur(gray, (0, 0), LIGHT_SIGMA * spec.width_m * patch.px_per_m)
     return replace(patch, gray=np.clip(np.round(gray - light + MIDDLE_GRAY), 0, 255).astype(np.uint8))
@@ -85,9 +85,12 @@ def _flattened(patch: Patch, spec: Lever) -> Patch:
 def _that_ends(
     patch: Patch, spec: Lever, angles_rad: Array, contrast: Array, hidden: NDArray[np.bool_] | None
 ) -> Array:
-    """(N,) contrasts of bars minus that of their continuation beyond the tips: a handle ends there, a cable does not."""
+    """Return the contrasts (N,) of bars minus that of their continuation beyond the tips.
+
+    A handle ends there, a cable does not.
+    """
     L, noise = spec.length_m, contrast_noise(patch)
-    shows = np.abs(contrast) > 1.5 * noise  # the others are too weak to be evidence
+    shows = np.abs(contrast) > 1.5 * noise  # weaker contrasts are no evidence
     if not shows.any():
         return contrast
     lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # outside the image, its border is repeated
@@ -109,7 +112,8 @@ def _that_ends(
 def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
     """Return whether the visible line is parallel to the state's direction and beside it, and no bar at an angle to it.
 
-    A handle as gray as the plate shows only by the shadow along its side; a handle between two states is not parallel.
+    A handle as gray as the plate is visible only by the shadow along its side; a handle between two states is not
+    parallel.
     """
     along_m = (BAR_FROM * spec.length_m, BAR_TO * spec.length_m)
     turned = parallel = 0.0
@@ -125,7 +129,7 @@ def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
 
 
 def _bar_angle(patch: Patch, spec: Lever, nominal: float, hidden: NDArray[np.bool_] | None) -> float:
-    """Direction of the bar near a state's nominal angle: the one with the most contrast."""
+    """Return the direction near a state's nominal angle in which the bar has the most contrast."""
     L = spec.length_m
     tried = nominal + SWEEP_RAD
     contrast = np.abs(

@@ -10,7 +10,7 @@ from perception.vision.status.reader import Reader
 
 
 def read_mushroom(patch: Patch, spec: Mushroom) -> PatchReading:
-    """State of an emergency-stop button. `patch` may show any plane near the cap."""
+    """Return the state of an emergency-stop button. `patch` may show any plane near the cap."""
     return read_cap(patch, spec, foot_m=None)  # the head moves as a whole
 
 

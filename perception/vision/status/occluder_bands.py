@@ -20,12 +20,12 @@ from hal.arrays import Array
 from perception.vision.patch import Patch, sample_at
 from perception.vision.status.occluders import OUTSIDE, Crossing, border_crossings, followed_in, smoothed
 
-SAME_GRAY = 16.0  # gray levels of variation along a band; real cables are slightly glossy
+SAME_GRAY = 16.0  # gray levels; largest variation along a band, because real cables are slightly glossy
 GROUND_SHARE = 0.5  # share of the contrast of a band within the window
 WHOLLY = 0.97  # share of the band's axis above which no refinement is needed
 ALONG_SHARE = 0.72  # share of the band's axis that must have its gray
-INSET = 0.09  # share of the smaller side, from the border to the inner path: clear of a frame, and outside the digits
-MOST_WIDTH = 0.5  # share of the object's smaller side: wider occluders are not handled here
+INSET = 0.09  # share of the smaller side, from the border to the inner path; inside a frame, and outside the digits
+MOST_WIDTH = 0.5  # share of the object's smaller side; wider occluders are not handled here
 BENDS = (
     0.0,
     -0.3,
@@ -44,25 +44,25 @@ BENDS = (
     4.5,
 )  # of the band's width, sideways
 INK_EDGE_PX = 4.0
-MOST_COVERED = 0.3  # share of a face: a larger followed region is the face itself, or a glare on it
+MOST_COVERED = 0.3  # share of a face; a larger followed region is the face itself, or glare on it
 WITHIN = np.linspace(-0.9, 0.9, 48)  # in half widths and heights
 # In band widths from the object's middle; angle from one of its own directions
 OWN_ASIDE, OWN_RAD = 0.6, np.deg2rad(12.0)
-BENT_AT = (0.5, 0.3, 0.7)  # share of its length
+BENT_AT = (0.5, 0.3, 0.7)  # tried places of the bend, as shares of the length
 CORE = 0.2  # half width of the strip about the axis in which a band's gray is measured, in band widths
-CENTRED = ((0.1, 0.3), (0.1, 0.15), (0.05, 0.08), (0.05, 0.04))
+CENTRED = ((0.1, 0.3), (0.1, 0.15), (0.05, 0.08), (0.05, 0.04))  # steps of place and size when the bend is centred
 FINER = ((0.14, 0.3), (0.07, 0.15))  # steps of place and size about the best bend
-MERGED = 1.7  # ratio of the widths of the two ends: something beside the cable has merged with it
+MERGED = 1.7  # ratio of the widths of the two ends from which something beside the cable has merged with it
 
 
 def hidden_by_bands(
     patch: Patch, *, half_width_m: float, half_height_m: float, dark_ink: bool
 ) -> NDArray[np.bool_] | None:
-    """(H, W) mask of the cables that cross a display in the patch; None when there is none.
+    """Return a mask (H, W) of the cables that cross a display in the patch; None if there are none.
 
     Args:
         dark_ink: whether segments are darker than their background. The blurred edge of a cable with the polarity of
-            the segments could pass for ink, so it is hidden too; the other edges are left visible.
+            the segments could be taken for ink, so it is hidden, too; the other edges are left visible.
     """
     smooth = smoothed(patch)
     inset = INSET * 2 * min(half_width_m, half_height_m)
@@ -97,10 +97,10 @@ def hidden_by_bands(
 def lying_across(
     patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, through: bool = False, most: float = 1.0
 ) -> NDArray[np.bool_] | None:
-    """(H, W) mask of the occluders of an object in the patch; None when there are none.
+    """Return a mask (H, W) of the occluders of an object in the patch; None if there are none.
 
-    Cables are searched first, as bands of one gray. Anything else that enters over the border is followed by its gray
-    (`covered`); unlike the band search, this leaks into a frame or a pointer of the same gray.
+    Cables are searched for first, as bands of one gray. Anything else that enters over the border is followed by its
+    gray (`covered`); unlike the band search, this leaks into a frame or a pointer of the same gray.
 
     Args:
         half_width_m, half_height_m, is_round, through: as for `followed_in`.
@@ -128,7 +128,7 @@ def lying_across(
 def _share(
     patch: Patch, mask: NDArray[np.bool_], half_width_m: float, half_height_m: float, *, is_round: bool
 ) -> float:
-    """Share of an object's face, without its frame, that a mask covers."""
+    """Return the share of an object's face, without its frame, that a mask covers."""
     x, y = np.meshgrid(WITHIN, WITHIN)
     face = np.hypot(x, y) < WITHIN[-1] + 1e-9 if is_round else np.ones(x.shape, bool)
     u, v = patch.pixel_of(x[face] * half_width_m, y[face] * half_height_m)
@@ -136,7 +136,7 @@ def _share(
 
 
 def cables_across(patch: Patch, *, radius_m: float, own_rad: Array) -> NDArray[np.bool_] | None:
-    """(H, W) mask of the cables that cross a disc about the object's middle; None when there are none.
+    """Return a mask (H, W) of the cables that cross a disc around the object's middle; None if there are none.
 
     Args:
         radius_m: radius of the disc, clear of the object's ends.
@@ -169,11 +169,14 @@ def _is_own(band: _Band, middle_px: Array, own_rad: Array) -> bool:
 def _bands_between(
     smooth: NDArray[np.uint8], ends: Sequence[Crossing], least_side_px: float, *, is_round: bool
 ) -> tuple[list[_Band], list[Crossing]]:
-    """The bands that join crossings, surest first and every end in one, and the crossings that are left."""
+    """Return the bands that join crossings, surest first, and the crossings that no band uses.
+
+    Every crossing belongs to at most one band, unless it is much wider than the band.
+    """
     found = []
     for (i, a), (k, b) in combinations(enumerate(ends), 2):
         if a.side != b.side or is_round:
-            tolerance = min(SAME_GRAY, GROUND_SHARE * min(a.by, b.by))  # else the plate beside would pass for it
+            tolerance = min(SAME_GRAY, GROUND_SHARE * min(a.by, b.by))  # lower than the contrast to the plate
             tried = (_joined(smooth, *pair, least_side_px, tolerance) for pair in _narrowed(a, b))
             found += [(band.share, i, k, band) for band in tried if band is not None]
     joined: set[int] = set()
@@ -186,7 +189,7 @@ def _bands_between(
 
 
 def _drawn(bands: Sequence[_Band], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(H, W) mask of bands with their blurred edges."""
+    """Return a mask (H, W) of bands with their blurred edges."""
     mask = np.zeros(shape, np.uint8)
     for band in bands:
         points, thick = np.round(band.points_px * 16).astype(np.int32), max(1, round(band.width_px + INK_EDGE_PX))
@@ -195,7 +198,10 @@ def _drawn(bands: Sequence[_Band], shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def _narrowed(a: Crossing, b: Crossing) -> list[tuple[Crossing, Crossing]]:
-    """The pair itself, or, where one end is much wider, pairs with parts of that end: a word or another cable is beside."""
+    """Return the pair itself or, if one end is much wider, pairs with parts of that end.
+
+    A word or another cable is then beside the cable.
+    """
     a, b = (a, b) if a.length_px <= b.length_px else (b, a)
     if b.length_px <= MERGED * a.length_px:
         return [(a, b)]
@@ -207,7 +213,7 @@ def _narrowed(a: Crossing, b: Crossing) -> list[tuple[Crossing, Crossing]]:
 
 
 def _ground(patch: Patch, half_width_m: float, half_height_m: float) -> float:
-    """Typical gray of the window."""
+    """Return the typical gray of the window."""
     x, y = np.meshgrid(np.linspace(-0.8, 0.8, 24) * half_width_m, np.linspace(-0.8, 0.8, 12) * half_height_m)
     return float(np.median(patch.sample(x, y, 0.0)))
 
@@ -215,7 +221,7 @@ def _ground(patch: Patch, half_width_m: float, half_height_m: float) -> float:
 def _joined(
     smooth: NDArray[np.uint8], a: Crossing, b: Crossing, least_side_px: float, tolerance: float
 ) -> _Band | None:
-    """The band between two places on the border; None when there is none."""
+    """Return the band between two places on the border; None if there is none."""
     if abs(a.gray - b.gray) > 2 * SAME_GRAY or a.is_darker != b.is_darker:
         return None
     along = b.middle_px - a.middle_px
@@ -239,7 +245,8 @@ def _joined(
         return None
     if bend == 0.0:
         return _Band(points_px=band.points([(at, bend)])[0], width_px=width, share=share)
-    # Square to its legs it has another width than to the chord; many bends hold a thick cable's core, but one holds all.
+    # A bent band is narrower across its legs than across the chord. The core of a thick cable fits many bends, but the
+    # whole cable only one.
     width = min(_width(a, band, at, bend), _width(b, band, at, bend))
     whole = replace(band, half_px=max(CORE * width, width / 2 - INK_EDGE_PX))
     for step, size in CENTRED:
@@ -249,7 +256,7 @@ def _joined(
 
 
 def _width(end: Crossing, band: _Search, at: float, bend: float) -> float:
-    """Width of a bent band at one of its ends, square to its leg there."""
+    """Return the width of a bent band at one of its ends, perpendicular to its leg there."""
     _, knee, _ = band.points([(at, bend)])[0]
     leg = (knee - end.middle_px) / max(float(np.linalg.norm(knee - end.middle_px)), 1e-9)
     return end.length_px * abs(float(leg[0] * end.tangent[1] - leg[1] * end.tangent[0]))
@@ -257,7 +264,7 @@ def _width(end: Crossing, band: _Search, at: float, bend: float) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Band:
-    """A cable: (3, 2) its axis, its width, and the share of it that has its gray."""
+    """A cable: its axis (3, 2), its width, and the share of it that has its gray."""
 
     points_px: Array
     width_px: float
@@ -266,12 +273,15 @@ class _Band:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Search:
-    """Straight and bent bands between two crossings, by the share of what lies about their axis that has the crossings' gray.
+    """Search for straight and bent bands between two crossings, by the share of the band with the crossings' gray.
 
     Attributes:
-        across: (2,) square to the chord, as long as the band seems wide: bends are measured by it.
-        t: (N,) places looked at along the band, 0 to 1.
-        half_px: how far to either side of the axis is looked.
+        smooth: smoothed gray image.
+        a, b: the crossings.
+        across: (2,) perpendicular to the chord, as long as the band seems wide; the unit of bends.
+        t: (N,) places at which the band is sampled, 0 to 1.
+        half_px: distance from the axis of the samples on either side.
+        tolerance: largest difference from the crossings' gray.
     """
 
     smooth: NDArray[np.uint8]
@@ -283,15 +293,18 @@ class _Search:
     tolerance: float
 
     def points(self, shapes: list[tuple[float, float]]) -> Array:
-        """(N, 3, 2) axes of bands that are bent at a share of their length by so many widths."""
+        """Return the axes (N, 3, 2) of bands with a bend at a share of their length, by a number of widths."""
         a, b = self.a.middle_px, self.b.middle_px
         return np.array([[a, a + at * (b - a) + bend * self.across, b] for at, bend in shapes])
 
     def best(self, shapes: list[tuple[float, float]]) -> tuple[float, float, float]:
-        """Place and size of the best bend, and the share of that band; straight unless a bend is better."""
+        """Return place and size of the best bend, and the share of that band; straight unless a bend is better."""
         t, axes = self.t, self.points(shapes)
         knots = np.array([at for at, _ in shapes])[:, None]
-        first, second = np.minimum(t / knots, 1.0), np.maximum((t - knots) / (1.0 - knots), 0.0)  # along either leg
+        first, second = (
+            np.minimum(t / knots, 1.0),
+            np.maximum((t - knots) / (1.0 - knots), 0.0),
+        )  # positions along either leg
         axis = (
             axes[:, :1]
             + first[..., None] * (axes[:, 1] - axes[:, 0])[:, None]

@@ -1,7 +1,7 @@
-"""What lies across an object: cables and fingers come in over the border, which nothing of the object itself does.
+"""Search for occluders of an object: cables and fingers enter over its border, which no part of the object does.
 
-A path around the object, just outside of it, is searched for places that stand out from the plate; from each, the same
-gray is followed. What reaches deep into the object from there covers it.
+A path around the object, just outside of it, is searched for places that contrast with the plate; from each, the same
+gray is followed. If it reaches deep into the object, it covers the object.
 """
 
 from __future__ import annotations
@@ -18,23 +18,25 @@ from hal.jit import compiled
 from perception.vision.bilinear import step_counts
 from perception.vision.patch import Patch, sample_at
 
-STANDS_OUT = 14.0  # gray levels, and four sigmas of the noise; less in a dark picture, where everything does less
+STANDS_OUT = 14.0  # gray levels, and four sigmas of the noise; less in a dark picture, where all contrasts are lower
 STANDS_OUT_SHARE, LEAST_STANDS_OUT = 0.12, 5.0
-LARGEST_SHARE = 0.4  # of the object: what follows the gray of a cable and fills more has leaked into the object
-RIM_PX = 4.0
-LEAKED = 4.0  # times the way in along the border: what follows a frame has leaked into it
-OUTSIDE = 0.06  # of an object's larger half size: how far beyond its border the path runs
-DEEP = 0.35  # of the object's smaller half size: labels and ticks do not reach that far in
+LARGEST_SHARE = 0.4  # of the object; a larger region of a cable's gray has leaked into the object
+RIM_PX = 4.0  # width of the border zone
+LEAKED = 4.0  # ratio of a region's extent along the border to its width there, from which it has leaked into a frame
+OUTSIDE = 0.06  # distance of the path from the border, over the object's larger half size
+DEEP = 0.35  # of the object's smaller half size; labels and ticks do not reach so far inside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Crossing:
-    """A place on the path around an object that stands out from the plate: where something comes in.
+    """A place on the path around an object that contrasts with the plate, where something enters.
 
     Attributes:
         middle_px, tangent: (2,) its middle in the patch, and the path's unit direction there.
-        length_px: along the path, where it differs by more than half: without the skirts of its blur.
-        gray: of its middle; is_darker: than the plate round it; by: how many gray levels.
+        length_px: length along the path where the contrast exceeds half, without the skirts of its blur.
+        gray: of its middle.
+        is_darker: whether it is darker than the plate around it.
+        by: contrast to the plate in gray levels.
         side: of a rectangle's path, 0 to 3 from the top clockwise; 0 of a round one.
     """
 
@@ -48,10 +50,10 @@ class Crossing:
 
 
 def covered(patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool) -> NDArray[np.bool_] | None:
-    """(H, W) mask of the occluders of the object in the patch; None when there are none.
+    """Return a mask (H, W) of the occluders of the object in the patch; None if there are none.
 
     Args:
-        half_width_m, half_height_m: of the object; the patch must reach beyond it.
+        half_width_m, half_height_m: of the object; the patch must extend beyond it.
         is_round: whether the object is a disc (of `half_width_m`) and not a rectangle.
     """
     smooth = smoothed(patch)
@@ -69,12 +71,14 @@ def followed_in(
     patch: Patch, found: Sequence[Crossing], *, smooth: Image, half_width_m: float, half_height_m: float, is_round: bool,
     through: bool = False,
 ) -> NDArray[np.bool_] | None:  # fmt: skip
-    """(H, W) mask of what can be followed by its gray from crossings deep into the object; None when nothing can.
+    """Return a mask (H, W) of what can be followed by its gray from crossings deep into the object.
+
+    None if nothing can.
 
     Args:
         smooth: result of `smoothed` for the patch.
         half_width_m, half_height_m, is_round: as for `covered`.
-        through: count only what leaves at another side of a rectangle, because labels lead into a slot and end there.
+        through: whether it must leave at another side of a rectangle, because labels lead into a slot and end there.
     """
     if not found:
         return None
@@ -102,7 +106,7 @@ def border_crossings(
     patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, beyond: float = OUTSIDE,
     smooth: Image | None = None,
 ) -> list[Crossing]:  # fmt: skip
-    """Places just outside an object's border that contrast with the plate round them; arguments as for `covered`.
+    """Return the places just outside an object's border that contrast with the plate; arguments as for `covered`.
 
     Args:
         beyond: distance of the path from the border, over the larger half size.
@@ -130,7 +134,7 @@ def border_crossings(
         at = np.arange(first, last + 1) % n
         middle = int(at[len(at) // 2])
         step = points[(middle + 1) % n] - points[(middle - 1) % n]
-        gray = float(np.median(values[at[len(at) // 3 : len(at) - len(at) // 3]]))  # its edges are blurred
+        gray = float(np.median(values[at[len(at) // 3 : len(at) - len(at) // 3]]))  # without its blurred edges
         by = gray - float(typical[middle])
         found.append(
             Crossing(
@@ -147,18 +151,22 @@ def border_crossings(
 
 
 def smoothed(patch: Patch) -> Image:
-    """The smoothed gray image in which crossings are searched."""
+    """Return the smoothed gray image in which crossings are searched for."""
     return np.asarray(cv2.GaussianBlur(patch.gray, (0, 0), 1.0), np.uint8)
 
 
 def _sides(patch: Patch, points: Array, w: float, h: float) -> NDArray[np.int64]:
-    """(N,) side of the rectangle at which every point of its path lies: 0 to 3 from the top clockwise."""
+    """Return the side (N,) of the rectangle for every point of its path: 0 to 3 from the top clockwise."""
     x, y = ((points[:, k] - patch.pixel_of(0.0, 0.0, 0.0)[k]) / patch.px_per_m for k in (0, 1))
     flat = np.abs(y) - h > np.abs(x) - w
     return np.asarray(np.where(flat, np.where(y < 0, 0, 2), np.where(x > 0, 1, 3)), np.int64)
 
 
 def _path(patch: Patch, w: float, h: float, is_round: bool, beyond: float) -> tuple[Array, Array]:
+    """Return the patch coordinates u, v of a closed path around an object, enlarged by the factor `beyond`.
+
+    A rectangle is enlarged by the same amount on all sides.
+    """
     step = 0.8 / patch.px_per_m
     if is_round:
         a = np.linspace(0, 2 * np.pi, max(64, round(2 * np.pi * w * beyond / step)), endpoint=False)
@@ -173,7 +181,7 @@ def _path(patch: Patch, w: float, h: float, is_round: bool, beyond: float) -> tu
 
 
 def _depth(patch: Patch, w: float, h: float, is_round: bool) -> Array:
-    """(H, W) distance inside the object's border, px; negative outside."""
+    """Return the distance (H, W) inside the object's border, px; negative outside."""
     v, u = np.indices(patch.gray.shape)
     u0, v0 = patch.pixel_of(0.0, 0.0, 0.0)
     if is_round:
@@ -182,7 +190,7 @@ def _depth(patch: Patch, w: float, h: float, is_round: bool) -> Array:
 
 
 def _runs(odd: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and last index of every run of True around a closed path, neither single samples nor long stretches."""
+    """Return the first and last index of every run of True on a closed path, without single samples and long runs."""
     n = len(odd)
     if odd.all() or not odd.any():
         return []
@@ -194,6 +202,7 @@ def _runs(odd: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _followed(smooth: NDArray[np.uint8], seed: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return the connected region of about the same gray as the pixel `seed`."""
     mask = np.zeros((smooth.shape[0] + 2, smooth.shape[1] + 2), np.uint8)
     flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
     cv2.floodFill(smooth.copy(), mask, seed, 1.0, 16.0, 16.0, flags)
@@ -201,19 +210,20 @@ def _followed(smooth: NDArray[np.uint8], seed: tuple[int, int]) -> NDArray[np.bo
 
 
 def _noise(patch: Patch) -> float:
+    """Return the standard deviation of the patch's noise."""
     counts = step_counts(np.ascontiguousarray(patch.gray), 4)
     return float(np.searchsorted(np.cumsum(counts), 0.5 * counts.sum())) / 1.65
 
 
 @compiled
 def ring_medians(values: NDArray[np.uint8], size: int) -> Array:
-    """(N,) sliding median of `size` values (odd, at most N) along a closed path, by a sliding histogram."""
+    """Return the sliding median (N,) of `size` values (odd, at most N) along a closed path, by a sliding histogram."""
     n, half = len(values), size // 2
     counts = np.zeros(256, np.int64)
     for k in range(-half, half + 1):
         counts[values[k % n]] += 1
     medians = np.empty(n)
-    level, below = 0, 0  # below: how many of the window are less than level
+    level, below = 0, 0  # below: number of values in the window that are less than level
     for i in range(n):
         while below + counts[level] <= half:
             below += counts[level]

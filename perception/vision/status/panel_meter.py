@@ -1,4 +1,4 @@
-"""Rectangular moving-coil meters: a thin pointer about a pivot that may lie behind the lower cover."""
+"""Reader of rectangular moving-coil meters: a thin pointer about a pivot that may be behind the lower cover."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
 from perception.vision.status.pointer import find_pointer
 from perception.vision.status.reader import Reader
 
-POINTER_FROM, POINTER_TO = 0.30, 0.85  # share of the needle's length that is in the window, before the ticks begin
-RIVAL = (0.17, 0.02)  # nothing else stands there: of 240 on drawn hard panels read right .99 have less than 0.13
-SIGMA_RAD = (0.0125, 0.0015)  # .98 of them have less than 0.009, half of those read wrong more
+# Share of the needle's length that is visible in the window, up to where the ticks begin.
+POINTER_FROM, POINTER_TO = 0.30, 0.85
+RIVAL = (0.17, 0.02)  # no numerals are there: of 240 hard synthetic meters read correctly 99 % have less than 0.13
+SIGMA_RAD = (0.0125, 0.0015)  # 98 % of them have less than 0.009, half of the misread ones have more
 
 
 def read_panel_meter(patch: Patch, spec: PanelMeter) -> PatchReading:
-    """Value of a panel meter. `patch` shows the plane of the face, origin at the middle of the housing."""
+    """Return the value of a panel meter. `patch` shows the plane of the face, origin at the middle of the housing."""
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
     pivot = (0.0, -spec.pivot_below_m)
     seen = _seen(patch, spec, lo, hi)
@@ -42,6 +43,7 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> PatchReading:
 
 
 def _seen(patch: Patch, spec: PanelMeter, lo: float, hi: float) -> float:
+    """Return the visible share of the area that the pointer sweeps."""
     a = np.linspace(lo, hi, 24)
     r = np.array([0.5, 0.65, 0.8, 0.95])[:, None] * spec.needle_m
     return patch.seen(r * np.sin(a), r * np.cos(a) - spec.pivot_below_m)

@@ -1,7 +1,7 @@
 """Robust search for a pointer about a known pivot.
 
 The face is unrolled to (angle, radius). A morphological closing or opening along the angle estimates the face without
-thin structures; the difference (black-hat, white-hat) is the ink, free of glare, gradients and shadow borders. A
+thin structures; the difference (black-hat, white-hat) is the ink, without glare, gradients and shadow borders. A
 pointer has ink at *every* radius between hub and numerals; a numeral, a tick or a cable has it only at some. The score
 of an angle is therefore a low quantile over the radii, not their mean. The opposite, shorter end fails the same test.
 """
@@ -20,17 +20,18 @@ from perception.vision.patch import Patch
 from perception.vision.status.pointer_axis import pointer_axis
 
 ANGLE_STEP_PX = 0.7  # at the outer radius
-RIVAL_APART_RAD = np.deg2rad(14.0)  # further than a pointer is wide
-PIVOT_SIGMA_PX = 0.5  # how far the true pivot may lie from the registered middle, image px
-REFINE_RAD = float(np.deg2rad(7.0))
-ROUGH_SIGMA_RAD = float(np.deg2rad(3.0))  # of a pointer whose axis cannot be fitted
-ABOUT_RAD = float(np.deg2rad(60.0))  # pointer and numerals take less than half of that
-LEAST_OFF_FACE = 0.7  # of a pointer's ink: .99 of 250 pointers read right have more than 0.82
-#: Of the radii, those next to the hub, and how much more ink than there a pointer has on the whole: of 340 gauges' pointers at
-#: most 1.6 times as much, of numerals and words that were taken for one 2.5 times at least.
+RIVAL_APART_RAD = np.deg2rad(14.0)  # larger than the width of a pointer
+PIVOT_SIGMA_PX = 0.5  # standard deviation of the pivot's position relative to the registered middle, image px
+REFINE_RAD = float(np.deg2rad(7.0))  # half width of the search when the angle is refined
+ROUGH_SIGMA_RAD = float(np.deg2rad(3.0))  # standard deviation of a pointer whose axis cannot be fitted
+# Half width of the area whose median is the face; pointer and numerals cover less than half of it.
+ABOUT_RAD = float(np.deg2rad(60.0))
+LEAST_OFF_FACE = 0.7  # of a pointer's ink; 99 % of 250 pointers read correctly have more than 0.82
+#: Share of the radii next to the hub, and largest ratio of a pointer's ink at all radii to its ink there. For the
+#: pointers of 340 gauges the ratio is at most 1.6, for numerals and words that were taken for one at least 2.5.
 INNER_SHARE, INNER_TIMES = 1 / 3, 1.8
-CORRELATED = 2.0  # neighbouring rows of an oversampled patch share their noise
-TYPICAL_OF = 240  # columns that tell the ink of a face where no pointer is
+CORRELATED = 2.0  # because neighbouring rows of an oversampled patch share their noise
+TYPICAL_OF = 240  # number of columns from which the typical ink of a face is estimated
 
 Float32 = NDArray[np.float32]
 
@@ -41,15 +42,15 @@ class PointerFit:
 
     Attributes:
         angle_rad: clockwise from straight up.
-        sigma_rad: one sigma.
+        sigma_rad: standard deviation of the angle.
         strength: ink at the pointer over the ink's noise.
         contrast: ink at the pointer, gray levels.
         rival_ratio: score of the best other direction over this one's.
-        rival_rad: where that is.
-        supported: share of the radii with clear ink, of those that can be seen.
-        shown: the same of all radii.
-        is_dark: pointer darker than the face.
-        unknown: share of the directions that something lies across.
+        rival_rad: angle of that direction.
+        supported: share of the visible radii with clear ink.
+        shown: the same share of all radii.
+        is_dark: whether the pointer is darker than the face.
+        unknown: share of the directions that are mostly occluded.
     """
 
     angle_rad: float
@@ -80,16 +81,19 @@ def find_pointer(
     prior_pivot_px: float = PIVOT_SIGMA_PX,
     from_hub: bool = False,
 ) -> PointerFit | None:
-    """The pointer about `pivot_m`, or None when nothing stands out.
+    """Return the pointer about `pivot_m`, or None if none stands out.
 
     Args:
         inner_m, outer_m: radii over which every pointer has ink.
-        fine_m: radii used to refine the angle, from where the pointer is to where it ends.
+        fine_m: radii used to refine the angle, from where the pointer begins to where it ends.
         limits_rad: smallest and largest angle, or None for a full turn.
-        width_rad: what is wider than this is not a pointer.
-        cover: (H, W) mask of what lies across the face (see `cover`), or None.
-        dark: polarity if it is known.
-        from_hub: the inner radii are next to the hub, where the pointer has ink and numerals have none.
+        width_rad: anything wider is not a pointer.
+        plane_z_m: height of the pointer; None: that of the patch's plane.
+        quantile: of the ink over the radii that is the score of a direction.
+        cover: (H, W) mask of the occluders of the face, or None.
+        dark: polarity, if it is known.
+        prior_pivot_px: standard deviation of the pivot's position, image px.
+        from_hub: whether the inner radii are next to the hub, where the pointer has ink and numerals have none.
     """
     angles = _angles(patch, outer_m, limits_rad)
     radii = np.arange(min(inner_m, fine_m[0]), max(outer_m, fine_m[1]), 1.0 / patch.px_per_m)
@@ -126,7 +130,7 @@ def find_pointer(
 
 
 def _off_face(fit: PointerFit, polar: Float32, ink: Float32, angles: Array) -> float:
-    """Difference between a pointer's gray and the face's, relative to its ink.
+    """Return the difference between a pointer's gray and the face's, relative to its ink.
 
     A gap between two bright things has dark ink, but the face's gray.
     """
@@ -140,11 +144,12 @@ def _off_face(fit: PointerFit, polar: Float32, ink: Float32, angles: Array) -> f
 
 
 def _clarity(fit: PointerFit) -> float:
+    """Return how clearly a pointer stands out, for comparing both polarities."""
     return fit.strength * (1 - fit.rival_ratio)
 
 
 def unroll(patch: Patch, pivot_m: tuple[float, float], radii_m: Array, angles_rad: Array, z_m: float | None) -> Float32:
-    """(radii, angles) gray values about a pivot; angles clockwise from straight up."""
+    """Return the gray values (radii, angles) around a pivot; angles are clockwise from straight up."""
     u, v = patch.pixel_of(*pivot_m, z_m)
     grown = 1.0 if z_m is None else 1.0 + patch.growth_per_m * (z_m - patch.plane_z_m)
     directions = np.stack([np.sin(angles_rad), -np.cos(angles_rad)])
@@ -153,13 +158,13 @@ def unroll(patch: Patch, pivot_m: tuple[float, float], radii_m: Array, angles_ra
 
 
 def ink_along_angle(polar: Float32, width: float, is_dark: bool, *, wraps: bool) -> Float32:
-    """Black-hat (or white-hat) along the angle; `width` in columns is the widest thing kept."""
+    """Return the black-hat (or white-hat) along the angle; `width` in columns is that of the widest structure kept."""
     size = max(3, round(width)) | 1
     pad = size
     wide = (
         np.pad(polar, ((0, 0), (pad, pad)), mode="wrap") if wraps else np.pad(polar, ((0, 0), (pad, pad)), mode="edge")
     )
-    wide = np.asarray(cv2.blur(wide, (1, 3)), np.float32)  # noise would otherwise lift the closing everywhere
+    wide = np.asarray(cv2.blur(wide, (1, 3)), np.float32)  # otherwise noise would raise the closing everywhere
     kernel = np.ones((1, size), np.uint8)
     operation = cv2.MORPH_BLACKHAT if is_dark else cv2.MORPH_TOPHAT
     ink = cv2.morphologyEx(wide, operation, kernel)[:, pad:-pad]
@@ -170,7 +175,7 @@ def ink_along_angle(polar: Float32, width: float, is_dark: bool, *, wraps: bool)
 def _hidden(
     patch: Patch, cover: NDArray[np.bool_] | None, pivot_m: tuple[float, float], radii_m: Array, angles_rad: Array
 ) -> NDArray[np.bool_]:
-    """(radii, angles) mask of the samples that are occluded or outside the image."""
+    """Return a mask (radii, angles) of the samples that are occluded or outside the image."""
     lost = ~patch.inside if cover is None else cover | ~patch.inside
     if not lost.any():
         return np.zeros((len(radii_m), len(angles_rad)), bool)
@@ -178,7 +183,10 @@ def _hidden(
 
 
 def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: float) -> Array:
-    """Mean of every column between two quantiles of the visible values; a column that is half hidden scores 0."""
+    """Return the mean of every column between two quantiles of the visible values.
+
+    0 if half of the column is hidden.
+    """
     if not hidden.any():
         first, last = _between(np.array(len(columns)), low, high)
         return np.asarray(np.sort(columns, axis=0)[int(first) : int(last)].mean(axis=0), float)
@@ -194,12 +202,13 @@ def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: flo
 
 
 def _between(count: NDArray[np.int64], low: float, high: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and last rank between two quantiles of `count` values, at least two ranks."""
+    """Return the first and last rank between two quantiles of `count` values, at least two ranks."""
     first = (low * count).astype(int)
     return first, np.maximum(first + 2, np.round(high * count).astype(int))
 
 
 def _angles(patch: Patch, outer_m: float, limits_rad: tuple[float, float] | None) -> Array:
+    """Return the angles at which the face is sampled."""
     step = ANGLE_STEP_PX / (outer_m * patch.px_per_m)
     if limits_rad is None:
         count = int(np.clip(2 * np.pi / step, 90, 1440))
@@ -211,7 +220,7 @@ def _angles(patch: Patch, outer_m: float, limits_rad: tuple[float, float] | None
 def _rough(
     ink: Float32, hidden: NDArray[np.bool_], angles: Array, *, wraps: bool, quantile: float, is_dark: bool, from_hub: bool
 ) -> PointerFit | None:  # fmt: skip
-    """Find the direction with the most ink at all radii, to one column; None when nothing stands out."""
+    """Find the direction with the most ink at all radii, to one column; None if none stands out."""
     everywhere = _ink_of_columns(ink, hidden, quantile)
     noise = 1.4826 * float(np.median(everywhere)) + 0.5
     score = _from_hub(everywhere, ink, hidden, quantile) if from_hub else everywhere
@@ -240,13 +249,13 @@ def _rough(
 
 
 def _ink_of_columns(ink: Float32, hidden: NDArray[np.bool_], quantile: float) -> Float32:
-    """(angles,) ink that a direction reaches at most of its radii."""
+    """Return the ink (angles,) that a direction reaches at most of its radii."""
     mean = _low_mean(ink, hidden, 0.5 * quantile, quantile + 0.25).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(mean[None], (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)[0], np.float32)
 
 
 def _from_hub(score: Float32, ink: Float32, hidden: NDArray[np.bool_], quantile: float) -> Float32:
-    """(angles,) score, reduced where the inner radii have little ink, because numerals and words begin further out."""
+    """Return the score (angles,), reduced if the inner radii have little ink: numerals and words begin farther out."""
     inner = max(2, round(INNER_SHARE * len(ink)))
     limit = INNER_TIMES * _ink_of_columns(ink[:inner], hidden[:inner], quantile)
     is_hidden = hidden[:inner].mean(axis=0) >= 0.5
@@ -254,5 +263,5 @@ def _from_hub(score: Float32, ink: Float32, hidden: NDArray[np.bool_], quantile:
 
 
 def wrapped(angle_rad: Array) -> Array:
-    """Angles brought to -pi..pi."""
+    """Return angles wrapped to -pi..pi."""
     return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)

@@ -1,4 +1,4 @@
-"""Compiled fit of a pointer's axis through its ink: theta(r) = theta0 + e / r, with e the pivot's offset across it."""
+"""Compiled fit of a pointer's axis through its ink: theta(r) = theta0 + e / r, with e the pivot's lateral offset."""
 
 from __future__ import annotations
 
@@ -8,26 +8,28 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from hal.jit import compiled, inlined
 
-NUMERAL, PLAIN = 1.8, 35.0  # times the ink of a row at that percentile: numerals and ticks may be beside half of them
-HALF_LEVEL = 0.3  # of a row's strongest ink: less is the pointer's blur
-OWN_WIDTH = (35.0, 0.6)  # percentile of the rows' widths; what is looked at to either side of the axis, over it
+# Largest ratio of a row's ink to this percentile of all rows; numerals and ticks may be beside half of the rows.
+NUMERAL, PLAIN = 1.8, 35.0
+HALF_LEVEL = 0.3  # of a row's strongest ink; less belongs to the pointer's blur
+OWN_WIDTH = (35.0, 0.6)  # percentile of the rows' widths, and half width of the next search relative to it
 ROUNDS, WEIGHINGS = 3, 5
 LEAST_ROWS = 3
-BESIDE = 2  # columns: what is blurred by what is hidden
-PIVOTS_AT_MOST = 2.0  # weight of a row over the typical one's
+BESIDE = 2  # columns around hidden ones, whose blur affects them
+PIVOTS_AT_MOST = 2.0  # largest weight of a row, relative to a typical one
 
 
 @inlined
 def row_centres(
     ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: Array, half: Array
 ) -> tuple[Array, Array, Array]:
-    """(rows,) centre of the ink (rad), its mass and its width (rad), within `half` of `middle` in every row.
+    """Return the centre of the ink (rad), its mass and its width (rad) in every row, within `half` of `middle`.
 
-    A pointer has one gray: rows with much stronger ink belong to a numeral or a tick beside it. Where the ink continues
-    under an occluder, its visible centre is not the pointer's centre and the row is dropped.
+    (rows,) each. A pointer has one gray: rows with much stronger ink belong to a numeral or a tick beside it. If the
+    ink continues under an occluder, its visible centre is not the pointer's centre, so the row is dropped.
 
     Args:
-        ink, hidden: (rows, angles); offset: (angles,) rad.
+        ink, hidden: (rows, angles).
+        offset: (angles,) rad.
         middle, half: (rows,) rad.
     """
     rows, columns = ink.shape
@@ -69,11 +71,12 @@ def _goes_under(
 
 @compiled
 def fitted_line(r: Array, theta: Array, mass: Array, e_sigma: float, least_m: float) -> tuple[float, float, float]:
-    """theta0, e and the variance of theta0 of theta(r) = theta0 + e / r, by Cauchy-weighted least squares.
+    """Fit theta(r) = theta0 + e / r by Cauchy-weighted least squares; returns theta0, e and the variance of theta0.
 
     Args:
-        r, theta, mass: (N,) of rows with ink: m, rad, and its amount.
-        e_sigma: one sigma of e, m; least_m: of a row's centre across the pointer, m.
+        r, theta, mass: (N,) of rows with ink: m, rad, and amount of ink.
+        e_sigma: prior standard deviation of e, m.
+        least_m: least standard deviation of a row's centre across the pointer, m.
     """
     weight = np.minimum(mass / np.median(mass), PIVOTS_AT_MOST)
     theta0, e, variance = float(np.median(theta)), 0.0, 0.0
@@ -99,14 +102,17 @@ def pointer_axis(
     e_sigma: float,
     px_per_m: float,
 ) -> tuple[float, float]:
-    """Angle (rad, as `offset`) of the pointer near offset 0 and its variance; NaN where too few rows have ink.
+    """Return the angle (rad, as `offset`) of the pointer near offset 0, and its variance; NaN if too few rows have ink.
 
-    What touches the pointer (a numeral, a tick) widens some rows: each round looks within the pointer's own width only.
+    Things that touch the pointer (a numeral, a tick) widen some rows, so each round searches within the pointer's own
+    width.
 
     Args:
-        ink, hidden: (rows, angles); r: (rows,) m; offset: (angles,) rad from the rough pointer.
-        reach_rad: to either side that the first round looks.
-        e_sigma: one sigma of the pivot's offset, m.
+        ink, hidden: (rows, angles).
+        r: (rows,) m.
+        offset: (angles,) rad from the rough pointer.
+        reach_rad: half width of the search in the first round.
+        e_sigma: standard deviation of the pivot's offset, m.
     """
     middle, half = np.zeros(len(r)), np.full(len(r), reach_rad)
     theta0, variance = np.nan, np.nan

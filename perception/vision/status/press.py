@@ -1,6 +1,6 @@
 """Height of a round cap by parallax; needs a camera whose model includes heights (otherwise see `shade`).
 
-A cap at height z appears larger by z over the camera's distance and displaced by the parallax; its edge measures both.
+A cap at height z appears larger by z over the camera's distance, and displaced by the parallax; its edge shows both.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ from perception.vision.patch import Patch, sample_at
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.occluder_bands import cables_across
 
-EDGE_SIGMA_PX = 0.25  # of one edge point, image px, model error of a rendered or real cap included
-RESOLVED = 1.5  # widths of an edge: a wall that shows narrower runs into the face, and its foot cannot be told
-SHARP_PX, PULL = 1.8, 1.0  # edges wider than sharp ones are pulled by their neighbours: the excess times that, px
-RING, RING_SHARE, RING_NEAR_PX = (1.08, 1.5), 0.5, 2.0  # radii over the cap's; share of it that must show; image px
-CLEAR_OF_RING = 1.6  # of the cap's radius: what crosses a circle of that size is no part of the button
-PLACE_SIGMA_M = 3e-4  # building tolerance of the cap's place
+EDGE_SIGMA_PX = 0.25  # standard deviation of one edge point, image px, including model errors of the cap
+RESOLVED = 1.5  # widths of an edge; a wall that appears narrower merges with the face, and its foot cannot be located
+# Width of a sharp edge; the excess width times PULL is the shift of an edge by its neighbours, px.
+SHARP_PX, PULL = 1.8, 1.0
+# Radii over the cap's; least share of the ring that is visible; tolerance in image px.
+RING, RING_SHARE, RING_NEAR_PX = (1.08, 1.5), 0.5, 2.0
+CLEAR_OF_RING = 1.6  # of the cap's radius; anything that crosses a circle of that size is no part of the button
+PLACE_SIGMA_M = 3e-4  # building tolerance of the cap's position
 RADIUS_SIGMA_M = 1.5e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CapHeight:
-    """Measured height of a cap's edge above the plate, m, one sigma, and the share of the edge that was found."""
+    """Measured height of a cap's edge above the plate in m, standard deviation, and share of the edge that was found."""
 
     height_m: float
     sigma_m: float
@@ -34,14 +36,14 @@ class CapHeight:
 
 
 def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, foot_m: float | None) -> CapHeight | None:
-    """Height of a round cap by its silhouette, between the taught extremes; None when too little of it is found.
+    """Return the height of a round cap by its silhouette, between the taught extremes.
 
-    Where height moves the edge outward the silhouette is the cap's face; on the other side the wall shows and the
-    silhouette is the cap's foot, which does not move. The unknowns are height, shift and radius; shift and radius carry
-    the building tolerance as a prior.
+    None if too little of it is found. Where height moves the edge outward, the silhouette is the cap's face; on the
+    other side the wall is visible, and the silhouette is the cap's foot, which does not move. The unknowns are height,
+    shift and radius; shift and radius have the building tolerance as prior.
 
     Args:
-        foot_m: height of the foot's edge, None when it moves with the cap.
+        foot_m: height of the foot's edge; None if it moves with the cap.
     """
     middle = (low_m + high_m) / 2
     a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
@@ -64,7 +66,7 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     if ok.sum() < 0.4 * use.sum() or (ok & is_face).sum() < 6:
         return None
     if foot_m is not None and (~is_face).sum() > 8 and (ok & ~is_face).sum() < 0.4 * (~is_face).sum():
-        return None  # the foot is not where a cap of this size has it: something else was followed
+        return None  # the foot is not where a cap of this size has it, so other edges were found
     J = np.column_stack([np.where(is_face, outward, 0.0), np.sin(a), np.cos(a), np.ones_like(a)])[ok]
     prior = np.diag([1 / (high_m - low_m) ** 2, *[1 / PLACE_SIGMA_M**2] * 2, 1 / RADIUS_SIGMA_M**2])
     wall_px = np.abs(expected) * patch.image_px_per_m
@@ -78,7 +80,7 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
         N = J.T @ (w[:, None] * J) + prior
         solution = np.linalg.solve(N, J.T @ (w * measured))
     if float(np.median(np.abs(measured - J @ solution) / sigma)) > 2.0:
-        return None  # some other edge, a printed ring perhaps, was followed
+        return None  # another edge was found, such as that of a printed ring
     lean = float(np.mean(outward[is_face]))
     pull_m = PULL * max(width_px - SHARP_PX, 0.0) / patch.image_px_per_m / lean
     return CapHeight(
@@ -89,12 +91,12 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
 
 
 def _at(patch: Patch, r_m: Array, a: Array, z_m: float) -> tuple[Array, Array]:
-    """Patch coordinates of places about the middle, by radius and angle."""
+    """Return the patch coordinates of places around the middle, by radius and angle."""
     return patch.pixel_of(r_m * np.sin(a), r_m * np.cos(a), z_m)
 
 
 def _on_ring(patch: Patch, radius_m: float, a: Array, outward: Array, at_plate_m: Array) -> NDArray[np.bool_]:
-    """(N,) mask of the face's edges that belong to a ring round the cap, printed or flat, which is as gray as the cap.
+    """Return a mask (N,) of the face's edges that belong to a ring around the cap, printed or flat, as gray as the cap.
 
     The ring's outer edge is visible all along the side where height does not move the cap over it.
 
@@ -116,7 +118,10 @@ def _on_ring(patch: Patch, radius_m: float, a: Array, outward: Array, at_plate_m
 def _edges(
     patch: Patch, radius_m: float, a: Array, z_m: float, expected_m: Array, reach_m: Array
 ) -> tuple[Array, NDArray[np.bool_], float]:
-    """Radial offset of the strongest edge near each expected offset, whether it is one, and the edges' width, image px."""
+    """Return the radial offset of the strongest edge near each expected offset, and whether it is an edge.
+
+    Also returns the typical width of the edges, image px.
+    """
     t = np.linspace(-1.0, 1.0, 25)
     r = radius_m + expected_m[:, None] + reach_m[:, None] * t
     values = patch.sample(np.sin(a)[:, None] * r, np.cos(a)[:, None] * r, z_m)

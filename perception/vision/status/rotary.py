@@ -13,11 +13,11 @@ from perception.vision.status.reader import Reader
 
 MARK_FROM, MARK_TO = 0.35, 0.80  # share of the knob's radius over which the mark runs
 MARK_HALF_WIDTH = 0.06
-WOBBLE_RAD = np.deg2rad(np.linspace(-9, 9, 7))  # a detent may deviate from its nominal angle by this much
+WOBBLE_RAD = np.deg2rad(np.linspace(-9, 9, 7))  # tried deviations of a detent from its nominal angle
 
 
 def read_rotary(patch: Patch, spec: Rotary) -> PatchReading:
-    """State of a selector. `patch` shows the plane of the knob's face."""
+    """Return the state of a selector. `patch` shows the plane of the knob's face."""
     R = spec.radius_m
     angles = np.array([state.angle_rad for state in spec.states])
     half = max(MARK_HALF_WIDTH * R, 0.4 / patch.image_px_per_m)

@@ -1,6 +1,6 @@
 """Shading of a raised round cap seen from the front: its shadow or side on one side, and a highlight on its face.
 
-Both are measured round the cap by angle and radius. Occluded or saturated pixels and those outside the image are
+Both are measured around the cap by angle and radius. Occluded or saturated pixels and those outside the image are
 ignored; the illumination gradient over face and plate is removed first.
 """
 
@@ -39,15 +39,15 @@ BLOB = (9, 3)  # angles and radii that a highlight fills
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shades:
-    """Shading of a cap; NaN where too little is visible.
+    """Shading of a cap; NaN if too little is visible.
 
     Attributes:
-        shade: first harmonic of the ring round the cap, minus that of face and plate, over the plate's gray.
+        shade: first harmonic of the ring around the cap, minus that of face and plate, over the plate's gray.
         spot: excess of the face's brightest spot over its smooth illumination, relative to the residual of the rest of
             the face (its noise plus a hundredth of the plate's gray).
-        below: darkness of a gap round the cap below minus above, over the gray beside it and the radius; 0 where there
-            is no gap, or too little of it is visible. Light comes from above, so a cap's side and shadow are below; in
-            a cap that is pushed in, the collar's shadow is above.
+        below: darkness of a gap around the cap, below minus above, relative to the gray beside it and the radius; 0 if
+            there is no gap, or too little of it is visible. Light comes from above, so a cap's side and shadow are
+            below; if the cap is pushed in, the collar's shadow is above.
     """
 
     shade: float
@@ -56,7 +56,7 @@ class Shades:
 
 
 def cap_shades(patch: Patch, radius_m: float) -> Shades:
-    """Shadow and highlight of a round cap of that radius about the patch's middle."""
+    """Measure shadow and highlight of a round cap of that radius around the patch's middle."""
     hidden = cables_across(patch, radius_m=CLEAR_OF_RING * radius_m, own_rad=np.empty(0))
     lost = ~patch.inside | (patch.gray >= WHITE_LEVEL)
     if hidden is not None:
@@ -86,7 +86,7 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
 
 
 def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: float) -> float:
-    """`Shades.spot`; the illumination of a face without a highlight varies smoothly."""
+    """Return `Shades.spot`; the illumination of a face without a highlight varies smoothly."""
     x, y = np.outer(FACE_RADII, np.sin(ANGLES)), np.outer(FACE_RADII, np.cos(ANGLES))
     u, v = patch.pixel_of(radius_m * x, radius_m * y)
     gray = np.asarray(sample_at(patch.gray, u, v), float)
@@ -115,7 +115,10 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: floa
 
 
 def _below(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
-    """`Shades.below`; a registration error moves both edges of a gap alike, so its thickness on either side is unaffected."""
+    """Return `Shades.below`.
+
+    A registration error moves both edges of a gap alike, so it does not change the gap's thickness on either side.
+    """
     u, v = patch.pixel_of(radius_m * np.outer(GAP, np.sin(ANGLES)), radius_m * np.outer(GAP, np.cos(ANGLES)))
     gray = np.asarray(sample_at(patch.gray, u, v), float)
     known = (sample_at(unknown, u, v) > 0.5).mean(axis=0) < 0.2
@@ -131,13 +134,13 @@ def _below(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
 
 
 def _mean_round(patch: Patch, unknown: NDArray[np.uint8], radii_m: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(angles,) mean gray over some radii, and the angles at which most of them are unknown."""
+    """Return the mean gray (angles,) over some radii, and the angles at which most of them are unknown."""
     u, v = patch.pixel_of(np.outer(radii_m, np.sin(ANGLES)), np.outer(radii_m, np.cos(ANGLES)))
     return np.asarray(sample_at(patch.gray, u, v).mean(axis=0), float), sample_at(unknown, u, v).mean(axis=0) > 0.4
 
 
 def _wave(values: Array, known: NDArray[np.bool_]) -> Array:
-    """(3,) mean, cosine and sine of the known values round the cap, by iteratively reweighted least squares."""
+    """Return mean, cosine and sine (3,) of the known values around the cap, by iteratively reweighted least squares."""
     base, y = WAVES[known], values[known]
     weight, found = np.ones(len(y)), np.zeros(3)
     for _ in range(ROUNDS):

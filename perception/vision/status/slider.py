@@ -18,23 +18,24 @@ from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.reader import Reader
 
 SLOT = 0.2  # share of the cap's width: half of the slot plus its blur
-EDGE_BOX = 0.22  # share of the cap's length: a line across its middle is further than this from its edges
+EDGE_BOX = 0.22  # share of the cap's length; a line across its middle is farther than this from its edges
 LEAST_OPEN = 0.4  # share of a box that must not be occluded
 SLACK = 0.12  # share of the cap's length by which a cap may differ from its nominal length
 NEXT_TO = 0.4  # share of the cap's length: tolerance for two caps sharing an edge
 SAME_EDGE = 1.25  # times the cap's weaker edge
-#: Of the cap's length: half of what is averaged for a line across its middle, and how far beside it and how wide its flanks are.
+#: Line across a cap's middle, in cap lengths: half of its averaged width, and distance and width of its flanks.
 LINE, LINE_FLANK, LINE_WIDTH = 0.05, 0.15, 0.10
-LINE_NEAR = 0.17  # share of the cap's length: distance from the middle of its edges, one of which its shadow may shift
+# Share of the cap's length: largest distance from the middle of its edges, as its shadow may shift one of them.
+LINE_NEAR = 0.17
 # Least contrast of a line: in sigmas of the contrast's noise, and as a share of the cap's edge
 LINE_NOISES, LINE_SHARE = 2.0, 0.15
-NO_LINE = 0.75  # of 12 caps in bad light without a visible line 8 were right: cables and glare are taken for caps
+NO_LINE = 0.75  # of 12 caps in bad light without a visible line 8 were correct, because cables and glare resemble caps
 BEYOND, MOST_BEYOND = 0.8, 0.4  # in cap widths from the track; share that may be as dark there
 SIDES = np.linspace(-0.40, 0.40, 17)  # in cap widths: inside the cap
 
 
 def read_slider(patch: Patch, spec: Slider) -> PatchReading:
-    """Value of a slider. `patch` shows the plane of the cap's top."""
+    """Return the value of a slider. `patch` shows the plane of the cap's top."""
     along, across = spec.cap_size_m[0], spec.cap_size_m[1]
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
     step = 1.0 / patch.px_per_m
@@ -44,7 +45,7 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     u, v = patch.pixel_of(*_place(spec.angle_rad, s, np.zeros(1)))
     if float(np.mean(sample_at(patch.inside.astype(np.uint8), u, v))) < 0.97:
         return refused("part of the track is outside the image: move the camera", unit=spec.scale.unit)
-    lean_m = _base_shift_m(patch, spec, s)  # where the foot of a cap appears relative to its top
+    lean_m = _base_shift_m(patch, spec, s)  # displacement of a cap's foot from its top in the image
     open_ = _uncovered(patch, spec, s, np.minimum(left, right), float(np.median(lean_m)))
     found = _best_pair(left, right, s, open_, along_m=along, lean_m=lean_m, limits_m=(lo, hi))
     noise = contrast_noise(patch)
@@ -88,10 +89,11 @@ class _Cap:
 def _best_pair(
     left: Array, right: Array, s: Array, open_: Array, *, along_m: float, lean_m: Array, limits_m: tuple[float, float]
 ) -> _Cap:
-    """Find the pair of opposite edges that are one cap length apart; what lies between them (a line, a highlight) is ignored.
+    """Find the pair of opposite edges that are one cap length apart.
 
-    Every edge counts with the weaker of the two sides of the slot, and the pair with its weaker edge: a tick or a label
-    is on one side, glare and shadow have one edge.
+    Anything between them (a line, a highlight) is ignored. Every edge counts with the weaker of the two sides of the
+    slot, and the pair with its weaker edge, because a tick or a label is on one side, and glare and shadow have one
+    edge.
     """
     step = float(s[1] - s[0])
     low_shift, high_shift = along_m / 2 - np.minimum(lean_m, 0.0), along_m / 2 + np.maximum(lean_m, 0.0)
@@ -108,7 +110,7 @@ def _best_pair(
         )
         no_low, no_high = (np.interp(s + shift, s, hidden) > 0.5 for shift in (-low_shift, high_shift))
         score = np.where(off | no_low | no_high, 0.0, np.minimum(at_low, at_high))
-        # A candidate with one edge under a cable may be the cap as well: it is a rival with its visible edge alone.
+        # A candidate with one edge under a cable may also be the cap, so it is a rival with its visible edge alone.
         perhaps = np.where(no_low, np.where(no_high, 0.0, at_high), np.where(no_high, at_low, score))
         sides.append((score, np.where(off, 0.0, perhaps), into, out))
     (score, perhaps, into, out), other = sorted(sides, key=lambda side: -float(side[0].max()))
@@ -134,9 +136,10 @@ def _best_pair(
 def _line(
     left: Array, right: Array, s: Array, open_: Array, *, near_m: float, along_m: float, least: float
 ) -> float | None:
-    """Place of the line across the cap's middle, m along the track; None where no line shows on both sides of the slot.
+    """Return the position of the line across the cap's middle, m along the track.
 
-    A cap casts a shadow of nearly its own gray to one side, which shifts that edge; the line on its top is not shifted.
+    None if it is not visible on both sides. A cap casts a shadow of nearly its own gray to one side, which shifts that
+    edge but not the line on its top.
     """
     step = float(s[1] - s[0])
     thin, far, wide = (max(1, round(k * along_m / step)) for k in (LINE, LINE_FLANK, LINE_WIDTH / 2))
@@ -156,7 +159,7 @@ def _line(
 
 
 def _fall(profile: Array, open_: Array, box: float) -> Array:
-    """Decrease of gray at every place: mean over a box before it minus mean over a box behind it; NaN if occluded."""
+    """Return the decrease of gray at every place: mean over a box before it minus that behind it; NaN if occluded."""
     n = max(2, round(box))
     weight, gray = np.pad(open_, n, mode="edge"), np.pad(profile, n, mode="edge")
     count, total = (np.concatenate([[0.0], np.cumsum(x)]) for x in (weight, weight * gray))
@@ -171,20 +174,23 @@ def _fall(profile: Array, open_: Array, box: float) -> Array:
 
 
 def _near(profile: Array, reach: float) -> Array:
-    """Running maximum within `reach` samples."""
+    """Return the running maximum within `reach` samples."""
     kernel = np.ones((1, 2 * max(1, round(reach)) + 1), np.uint8)
     return np.asarray(cv2.dilate(np.asarray(profile, np.float32)[None], kernel)[0], float)
 
 
 def _both_sides(edges: Array, white: Array) -> Array:
-    """(N,) the weaker of the two sides' edges; where one side is saturated, its edge is too weak and the other side is used."""
+    """Return the weaker (N,) of the two sides' edges, or the other side's edge where one side is saturated.
+
+    On a saturated side an edge appears too weak.
+    """
     weaker = edges.min(axis=0)
     blind = white > 0
     return np.asarray(np.where(blind[0] != blind[1], np.where(blind[0], edges[1], edges[0]), weaker))
 
 
 def _crest(s: Array, edge: Array, at_m: float, reach_m: float) -> float:
-    """Place of an edge signal's maximum within reach of a place, m."""
+    """Return the position of an edge signal's maximum within reach of a place, m."""
     near = np.flatnonzero(np.abs(s - at_m) <= reach_m + (s[1] - s[0]))
     k = int(near[edge[near].argmax()])
     if not 0 < k < len(s) - 1:
@@ -195,8 +201,8 @@ def _crest(s: Array, edge: Array, at_m: float, reach_m: float) -> float:
 
 
 def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: float) -> Array:
-    """1 where nothing occludes the track, else 0."""
-    # The cap stands out and may lean over the footprint, so search for what enters from further away.
+    """Return 1 where nothing occludes the track, else 0."""
+    # The cap stands out and may extend beyond the footprint, so occluders are searched for farther out.
     lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
     room_m = 0.004 + lean_px / patch.px_per_m
     width, height = spec.half_footprint_m
@@ -238,21 +244,22 @@ def _is_cap(profile: Array, beyond: Array, s: Array, open_: Array, width_m: floa
 
 
 def _closed(profile: Array, width: float) -> Array:
+    """Return the profile after a morphological closing."""
     kernel = np.ones((1, max(3, round(width)) | 1), np.uint8)
     return np.asarray(cv2.morphologyEx(profile.astype(np.float32)[None], cv2.MORPH_CLOSE, kernel)[0], float)
 
 
 def _open(patch: Patch, cover: NDArray[np.bool_], angle_rad: float, s: Array, across_m: float) -> Array:
-    """1 where nothing occludes the track, else 0."""
+    """Return 1 where nothing occludes the track, else 0."""
     u, v = patch.pixel_of(*_place(angle_rad, s, np.linspace(-1.0, 1.0, 5) * across_m))
     return np.asarray(sample_at(cover.astype(np.uint8), u, v).max(axis=1) < 0.3, float)
 
 
 def _base_shift_m(patch: Patch, spec: Slider, s: Array) -> Array:
-    """(N,) distance along the track, m, by which the foot of a cap at each place `s` (N,) appears displaced from its top.
+    """Return the displacement (N,), m along the track, of a cap's foot from its top in the image, at places `s` (N,).
 
-    The foot is further from the camera than the top, so it appears nearer to the camera's foot point: seen from before
-    the track's middle, a cap at its end leans by a millimetre.
+    The foot is farther from the camera than the top, so it appears nearer to the point below the camera: seen from in
+    front of the track's middle, a cap at its end leans by a millimetre.
     """
     u, v = -patch.parallax_px_per_m * spec.cap_size_m[2] / patch.px_per_m
     at_middle_m = float(u * np.cos(spec.angle_rad) - v * np.sin(spec.angle_rad))
@@ -260,7 +267,7 @@ def _base_shift_m(patch: Patch, spec: Slider, s: Array) -> Array:
 
 
 def _beside_slot(patch: Patch, spec: Slider) -> tuple[Array, Array]:
-    """Distances across the track, m, at which the cap is searched: inside the cap, and off the slot as it appears.
+    """Return the distances across the track, m, at which the cap is searched for: inside the cap, and not on the slot.
 
     The slot lies deeper than the cap's top, so in an oblique view it appears displaced from the track's middle.
     """
@@ -275,11 +282,13 @@ def _beside_slot(patch: Patch, spec: Slider) -> tuple[Array, Array]:
 
 
 def _place(angle_rad: float, s: Array, across: Array) -> tuple[Array, Array]:
+    """Return x, y of positions along the track and across it."""
     c, n = np.cos(angle_rad), np.sin(angle_rad)
     return s[:, None] * c - across * n, s[:, None] * n + across * c
 
 
 def _profile(patch: Patch, angle_rad: float, s: Array, across: Array) -> Array:
+    """Return the gray along the track, averaged over the distances `across`."""
     return np.asarray(patch.sample(*_place(angle_rad, s, across)).mean(axis=1), float)
 
 

@@ -15,20 +15,20 @@ from perception.vision.status.reader import Reader
 STATES, LEANS = ("on", "off"), (0.0, np.pi)  # clockwise from up
 BAT_FROM, BAT_TO = 0.62, 0.95  # share of the length: the nut around the foot looks like a bar too
 BRIGHT_ODDS = 2.0  # prior for a bright bat: bats are usually metal or white, rarely darker than their base
-BEYOND = (1.5, 3.0)  # in bat radii past its tip: clear of its round end
-BEHIND = (0.8, 1.7)  # in bat radii behind the foot: still before the nut
+BEYOND = (1.5, 3.0)  # in bat radii past its tip, outside its round end
+BEHIND = (0.8, 1.7)  # in bat radii behind the foot, not yet at the nut
 GOES_ON = 3.0  # weight of the contrast beyond the ends, which may be weaker there
 PIVOT_M = 0.004  # height above the plate of the point about which a bat turns
 FLANK, WIDE_FLANK = (
     (1.6, 1.9),
     (2.3, 2.6),
-)  # of 0.8 of the bat's radius: what is compared with it lies that far beside its axis
-AT_FOOT = (0.15, 0.5)  # share of the length: there a bat as gray as the plate contrasts with the nut about its foot
-AT_FOOT_NOISE = 3.0  # times the noise of a contrast: less is no evidence there
+)  # distances from the axis of the stripes that are compared with the bat, over 0.8 of its radius
+AT_FOOT = (0.15, 0.5)  # share of the length in which a bat as gray as the plate contrasts with the nut around its foot
+AT_FOOT_NOISE = 3.0  # times the noise of a contrast; less is no evidence there
 
 
 def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
-    """State of a toggle switch. `patch` shows the plate (or any plane, because heights are taken into account)."""
+    """Return the state of a toggle switch. `patch` shows the plate, or any other plane, as heights are considered."""
     reach = spec.bat_length_m * np.sin(spec.tilt_rad)
     y = np.linspace(-1, 1, 12)[:, None] * reach
     seen = patch.seen(np.array([-1.0, 0.0, 1.0]) * spec.bat_radius_m + 0 * y, y + np.zeros(3))
@@ -39,20 +39,28 @@ def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
         status = choose(STATES, _of_one_colour(contrast), noise=noise, seen=seen, what="bat")
         if status.answered and status.state is not None:
             k = STATES.index(status.state)
-            if contrast[k] < 0.0 < at_foot[1 - k]:  # a dark bar here, and a bright bat before its nut there
+            if (
+                contrast[k] < 0.0 < at_foot[1 - k]
+            ):  # a dark bar on this side, and a bright bat in front of its nut on the other
                 return doubted(status, "something lies across the bat: move it or look past it")
             return status
     return choose(STATES, np.abs(at_foot), noise=noise, seen=seen, what="bat")
 
 
 def _of_one_colour(contrast: Array) -> Array:
-    """(2,) evidence per state: if one side is dark and the other bright, the dark one is the rest of the switch."""
+    """Return the evidence (2,) per state.
+
+    If one side is dark and the other bright, the dark one is the rest of the switch.
+    """
     rivals = (np.maximum(contrast, 0.0), BRIGHT_ODDS), (np.maximum(-contrast, 0.0), 1.0)
     return np.asarray(max(rivals, key=lambda e: e[0].max() * e[1])[0])
 
 
 def _at_foot(patch: Patch, spec: Toggle, noise: float) -> Array:
-    """(2,) signed contrast of the bat before its nut, towards `LEANS`; zeros where it does not stand out on one side only."""
+    """Return the signed contrast (2,) of the bat in front of its nut, towards `LEANS`.
+
+    Zeros unless on one side only.
+    """
     contrast = np.array([_stretch(patch, spec, angle, AT_FOOT, FLANK) for angle in LEANS])
     size = np.abs(contrast)
     stands_out = size.max() > AT_FOOT_NOISE * noise and size.min() < 0.5 * size.max()
@@ -62,7 +70,10 @@ def _at_foot(patch: Patch, spec: Toggle, noise: float) -> Array:
 def _stretch(
     patch: Patch, spec: Toggle, angle_rad: float, along: tuple[float, float], flank: tuple[float, float]
 ) -> float:
-    """Signed contrast of a stretch of a bat that leans towards an angle; `along` and `flank` in shares, see `FLANK`."""
+    """Return the signed contrast of a stretch of a bat that leans towards an angle.
+
+    `along`: shares of the bat's length; `flank`: see `FLANK`.
+    """
     reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
     first, last = along
     contrast = bar_contrast(
@@ -73,9 +84,10 @@ def _stretch(
 
 
 def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float]) -> float:
-    """Signed contrast of a bat that leans towards an angle, minus its continuation beyond the tip or behind the foot.
+    """Return the signed contrast of a bat that leans towards an angle, minus that of its continuation.
 
-    A bat ends there. A cable does not, nor does the bat in its other position where the view runs along both.
+    The continuation is beyond the tip or behind the foot. A bat ends there. A cable does not, nor does the bat in its
+    other position if the view runs along both.
     """
     reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
 
@@ -88,7 +100,7 @@ def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float
         spec.bat_radius_m * patch.px_per_m / max(float(np.linalg.norm(tip - foot)), 1e-9)
     )  # of the bat as it appears
     if radii > 1.0:
-        return bat  # seen end-on, it has no length
+        return bat  # seen from its end, the bat has no length
     beyond, behind = (
         _stretch(patch, spec, angle_rad, along, flank)
         for along in ((1.0 + BEYOND[0] * radii, 1.0 + BEYOND[1] * radii), (-BEHIND[1] * radii, -BEHIND[0] * radii))

@@ -1,4 +1,4 @@
-"""The code blocks of the pages, and what each says about how it is tested."""
+"""Code blocks of the documentation pages, and how each states that it is tested."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _BLOCK = re.compile(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """One fenced block of a page.
+    """Fenced block of a page.
 
     Attributes:
-        mark: "fragment" for a block that nobody can run as it stands, "test" for one that a test of its own runs, else "".
+        mark: "fragment" for a block that cannot be run unchanged, "test" for one that a separate test runs, else "".
         said: the reason of a fragment, or the test's `file::function`.
     """
 
@@ -32,7 +32,7 @@ class Block:
 
 
 def blocks() -> Iterator[Block]:
-    """Every Python and shell block of every page, in order."""
+    """Return the Python and shell blocks of all pages, in order."""
     for page in PAGES:
         for found in _BLOCK.finditer(page.read_text(encoding="utf-8")):
             if found["language"] in RUNNABLE:
@@ -46,5 +46,5 @@ def blocks() -> Iterator[Block]:
 
 
 def page_name(page: Path) -> str:
-    """The path of a page within the tree."""
+    """Return the path of a page relative to the repository."""
     return page.relative_to(ROOT).as_posix()

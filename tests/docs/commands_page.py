@@ -13,7 +13,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
 
 
 def text() -> str:
-    """The page as it should be."""
+    """Return the page as generated from the commands."""
     command = typer.main.get_command(_app())
     page = get_docs_for_click(obj=command, ctx=typer.Context(command), name="panelwright", title="Command line")
     return "\n".join(line.rstrip() for line in page.strip().splitlines()).replace("```console", "```text") + "\n"

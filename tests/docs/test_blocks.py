@@ -1,4 +1,4 @@
-"""Every Python and shell block of the pages runs as it stands, or says why it does not."""
+"""Every Python and shell block of the pages runs unchanged, or states why it does not."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_block_that_is_not_run_here_says_why_or_names_its_test(block: Block) -
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
-    """A service on the bench cell, as `panelwright serve` starts it."""
+    """Yield a service on the bench cell, as `panelwright serve` starts it."""
     options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"))
     panelwright = Panelwright(load_cell(ROOT / "cells" / "bench.toml"), options)
     panelwright.start()
@@ -68,7 +68,7 @@ def test_the_blocks_of_a_page_run_one_after_the_other(
 
 
 def addressed(code: str, served: Panelwright) -> str:
-    """The block with the addresses of the running service in the place of the usual ones."""
+    """Return the block with the addresses of the running service instead of the default ones."""
     api, stop = served.url, served.stop_url.removesuffix("/v1/stop")
     for usual, address in (("127.0.0.1:8460", api), ("localhost:8460", api), ("localhost:8461", stop)):
         code = code.replace(f"http://{usual}", address).replace(usual, address)
@@ -76,14 +76,14 @@ def addressed(code: str, served: Panelwright) -> str:
 
 
 def commands(code: str) -> str:
-    """What a person types in a terminal session: the lines behind `$`."""
+    """Return the input of a terminal session: the lines after `$`."""
     return "\n".join(line[2:] for line in code.splitlines() if line.startswith("$ "))
 
 
 def run_shell(script: str, folder: Path) -> None:
     """Run the shell blocks of a page, which must all succeed, with this environment's commands first on the path."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
-    (folder / ".curlrc").write_text("fail-with-body\n", encoding="utf-8")  # an answer that is a problem is a failure
+    (folder / ".curlrc").write_text("fail-with-body\n", encoding="utf-8")  # an HTTP error status is a failure
     done = subprocess.run(
         ["bash", "-euxo", "pipefail", "-c", script],
         cwd=folder,

@@ -1,4 +1,4 @@
-"""The Python of the pages runs as it stands, with what a page leaves to the reader handed in."""
+"""The Python code of the pages runs unchanged; the tests supply the values that a page leaves to the reader."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CAMERA_FROM_PANEL = RigidTransform.from_components(
 
 
 def run(page: str, **given: Any) -> dict[str, Any]:
-    """All names after the first Python block of `docs/page`."""
+    """Return all names defined after the first Python block of `docs/page`."""
     block = re.search(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), flags=re.DOTALL)
     assert block is not None
     names = dict(given)
@@ -53,7 +53,7 @@ def test_the_range_page_finds_its_wall() -> None:
 
 
 def test_the_fusion_page_fuses_an_edge_and_a_touch() -> None:
-    focal_px, height_m, row_px = 460.0, 0.8, 374.0  # the middle row of the page's edge
+    focal_px, height_m, row_px = 460.0, 0.8, 374.0  # the centre row of the edge in the page
     camera = Pinhole(fx_px=focal_px, fy_px=focal_px, cx_px=319.5, cy_px=239.5)
     above_m = height_m * (row_px - camera.cy_px) / focal_px
     base_from_camera = placed(0.4, above_m, height_m, facing=FACING)
@@ -61,7 +61,7 @@ def test_the_fusion_page_fuses_an_edge_and_a_touch() -> None:
         "explanation/fusion.md",
         camera=camera,
         base_from_camera=base_from_camera,
-        base_from_finger=placed(0.4, 0.25, 0.001),  # a millimetre before where the face is thought
+        base_from_finger=placed(0.4, 0.25, 0.001),  # a millimetre in front of the assumed face
         pose_from_the_lights=placed(0.0, 0.0, 0.0, sigma=0.05),
     )
     answer = found["answer"]
@@ -89,7 +89,7 @@ def test_the_pose_page_finds_the_drawn_panel() -> None:
 
 
 def drawn(*, lit: bool) -> NDArray[np.uint8]:
-    """A panel of squares behind `LENS`, with its four lights off or on."""
+    """Return an image by `LENS` of a panel of squares, with its four lights off or on."""
     rng = np.random.default_rng(5)
     image = np.full((LENS.height_px, LENS.width_px), 90, np.uint8)
     for _ in range(25):

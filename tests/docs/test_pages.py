@@ -1,4 +1,4 @@
-"""What the pages say is there: links lead somewhere, commands exist, shipped files load, no machine's paths."""
+"""What the pages refer to exists: links, commands and shipped files; and there are no paths of one machine."""
 
 from __future__ import annotations
 

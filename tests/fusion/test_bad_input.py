@@ -1,4 +1,4 @@
-"""What makes no sense is refused by index and reason; what cannot be known is said."""
+"""Invalid input is refused with index and reason; what cannot be determined is reported."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_all_bad_is_a_contradiction_and_no_pose() -> None:
 
 @pytest.mark.parametrize("count", [3, 5, 7])
 def test_where_nothing_agrees_each_measurement_is_named(count: int) -> None:
-    given = [mixture(count, 31 + k).measurements[k] for k in range(count)]  # of as many poses
+    given = [mixture(count, 31 + k).measurements[k] for k in range(count)]  # each of another pose
     with pytest.raises(Contradiction) as caught:
         fuse(given)
     named = [one["index"] for one in caught.value.details["outside"]]

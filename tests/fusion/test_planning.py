@@ -1,4 +1,4 @@
-"""The next measurement is the one that tells most per second, and what it was expected to tell is what it tells."""
+"""The next measurement is the one with the most information per second, and its information is as predicted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.fusion.test_shared_errors import BASE_FROM_PANEL, MOUNTS, draw
 
 
 def split(seed: int) -> tuple[list[Observation], list[Observation]]:
-    """Rays to the lights; touches and distances at four places."""
+    """Return candidates: rays to the lights, touches and distances at four places."""
     drawn = draw(np.random.default_rng(seed))
     return drawn[:4], drawn[4:]
 

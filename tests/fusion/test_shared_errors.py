@@ -1,4 +1,4 @@
-"""Fused observations: does the stated covariance hold when every error is drawn as stated?"""
+"""The stated covariance of fused observations is right if every error is drawn as stated."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SPOTS = ((0.285, 0.16), (-0.285, -0.16), (0.115, -0.205), (-0.115, 0.205))
 
 
 def facing(point_m: tuple[float, ...], distance_m: float, sensor: str) -> RigidTransform:
-    """`base_from_flange` with a sensor square before a panel point, by the nominal mount."""
+    """Return `base_from_flange` with a sensor that faces a panel point at a right angle, by the nominal mount."""
     panel_from_sensor = RigidTransform.from_components(
         np.array([*point_m[:2], distance_m]), transform_rpy((0, 0, 0), (np.pi, 0, 0)).rotation
     )
@@ -47,7 +47,7 @@ def facing(point_m: tuple[float, ...], distance_m: float, sensor: str) -> RigidT
 
 
 def draw(rng: np.random.Generator) -> list[Observation]:
-    """Readings whose every error is drawn with its stated sigma; each mount's error is drawn once."""
+    """Return readings with every error drawn by its stated sigma; the error of each mount is drawn once."""
     mounts = {
         name: perturbed(m.parent_from_child, rng.normal(size=6) * np.sqrt(np.diag(m.covariance)))
         for name, m in MOUNTS.items()
@@ -91,7 +91,7 @@ def draw(rng: np.random.Generator) -> list[Observation]:
 
 
 def depth_to_plate(base_from_sensor: RigidTransform) -> float:
-    """Along the sensor's z axis to the plate."""
+    """Return the distance to the plate along the sensor's z axis."""
     panel_from_sensor = BASE_FROM_PANEL.inv() * base_from_sensor
     return float(-panel_from_sensor.translation[2] / panel_from_sensor.rotation.apply([0.0, 0.0, 1.0])[2])
 

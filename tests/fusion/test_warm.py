@@ -1,4 +1,4 @@
-"""The hot loops are compiled before somebody waits for them."""
+"""The hot loops are compiled before a user waits for them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from tests.fusion.test_shared_errors import MOUNTS, draw
 
 
 def variants() -> dict[str, int]:
-    """How often each compiled loop of the package was compiled or loaded, by its name."""
+    """Return how often each compiled loop of the package was compiled or loaded, by name."""
     modules = [module for name, module in sys.modules.items() if name.startswith("fusion.")]
     loops = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
     return {f"{loop.py_func.__module__}.{loop.py_func.__name__}": len(loop.signatures) for loop in loops}
 
 
 def test_after_warming_up_no_fusion_waits_for_a_compiler() -> None:
-    p = mixture(16, 3, bad=4)  # making a problem is nothing that a user waits for
+    p = mixture(16, 3, bad=4)  # made before, because users do not make simulated problems
     warm_up()
     warm = variants()
     assert any(warm.values())

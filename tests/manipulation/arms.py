@@ -1,4 +1,4 @@
-"""Two arms to test with, and slow plain numpy oracles."""
+"""Two arms for tests, and slow reference implementations in plain numpy."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ UR = _arm(
 
 
 def forward(capabilities: ArmCapabilities, q: np.ndarray) -> np.ndarray:
-    """(4, 4) base_from_flange by elementary rotations: the oracle of the compiled chain."""
+    """Return (4, 4) base_from_flange by elementary rotations, the reference for the compiled chain."""
     pose = np.eye(4)
     for link, angle in zip(capabilities.links, q, strict=True):
         pose = pose @ _rotate(2, angle + link.offset_rad) @ _shift(0, 0, link.d_m) @ _shift(link.a_m, 0, 0)

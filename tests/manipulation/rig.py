@@ -1,4 +1,4 @@
-"""A small kinematic cell in numpy: an arm that goes where it is told, a soft wall, a gripper, and faults on demand."""
+"""Small kinematic cell in numpy: an arm that reaches its set-points, a soft wall, a gripper, and optional faults."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from tests.manipulation.arms import T3
 GRIP = transform_rpy((0.0, 0.0, 0.2), (0.0, 0.0, 0.0))
 SENSOR = transform_rpy((0.0, 0.0, 0.02), (0.1, -0.2, 0.3))
 LOAD = ToolLoad(mass_kg=0.9, centre_of_mass_m=(0.01, 0.0, 0.09), bias=(1.0, -2.0, 0.5, 0.02, 0.0, -0.01))
-FRAMES = Kinematics.of(T3)  # test_kinematics holds the independent oracle
+FRAMES = Kinematics.of(T3)  # verified by the independent reference in test_kinematics
 HOME = np.array([0.0, 0.6, 0.3, 0.2, 0.7, 0.1])
 
 
 @dataclass
 class World:
-    """Joints, a wall at `wall_x_m` with stiffness `k`, and what is broken."""
+    """Joints, a wall at `wall_x_m` with stiffness `k`, and the faults."""
 
     clock: SimClock = field(default_factory=SimClock)
     q: np.ndarray = field(default_factory=HOME.copy)
@@ -50,13 +50,13 @@ class World:
     width_target_m: float = 0.05
     wall_x_m: float = np.inf
     wall_n_per_m: float = 5000.0
-    stride_rad: float | None = None  # farther from the set-point before than this the arm takes none
-    bias_rad: float = 0.0  # of what the arm says of its joints
+    stride_rad: float | None = None  # the arm rejects set-points further than this from the previous one
+    bias_rad: float = 0.0  # error of the arm's joint readings
     enabled: bool = False
     commands: list[np.ndarray] = field(default_factory=list)
     silent: set[str] = field(default_factory=set)
     frozen: set[str] = field(default_factory=set)
-    repeating: set[str] = field(default_factory=set)  # the same reading under new stamps
+    repeating: set[str] = field(default_factory=set)  # devices that repeat one reading with new stamps
     defective: set[str] = field(default_factory=set)
     before_step: Callable[[], None] = lambda: None
     ticks: int = 0
@@ -66,7 +66,7 @@ class World:
         self.clock.attach(self.advance)
 
     def advance(self, duration_s: float) -> float:
-        """One tick: the arm reaches its set-point, the pads creep to their width."""
+        """Advance by one tick: the arm reaches its set-point, and the pads move slowly to their width."""
         self.before_step()
         self.velocity = (self.target - self.q) / duration_s
         self.q = self.target.copy()
@@ -76,16 +76,16 @@ class World:
         return self.clock.now_s() + duration_s
 
     def tip(self) -> np.ndarray:
-        """(4, 4) base_from_grip."""
+        """Return (4, 4) base_from_grip."""
         return FRAMES.flange(self.q).as_matrix() @ GRIP.as_matrix()
 
     def contact_force(self) -> np.ndarray:
-        """Force of the wall on the tip, base axes."""
+        """Return the force of the wall on the tip, in base axes."""
         depth = self.tip()[0, 3] - self.wall_x_m
         return np.array([-self.wall_n_per_m * max(0.0, depth), 0.0, 0.0])
 
     def wrench(self) -> np.ndarray:
-        """Raw wrench in sensor axes: contact at the tip, weight at the centre of mass, bias."""
+        """Return the raw wrench in sensor axes: contact at the tip, weight at the centre of mass, bias."""
         sensor = FRAMES.flange(self.q).as_matrix() @ SENSOR.as_matrix()
         rotation = sensor[:3, :3].T
         weight = rotation @ np.array([0.0, 0.0, -9.80665 * LOAD.mass_kg])
@@ -136,7 +136,7 @@ class FakeArm(_Device):
         if not self.world.enabled:
             raise DeviceUnavailable("arm is not enabled", hint="enable", device=self.name)
         sent = position_rad.copy()
-        if self.world.stride_rad is not None:  # as drives do that know where they are
+        if self.world.stride_rad is not None:  # as drives do that know their position
             sent = np.clip(sent, self.world.target - self.world.stride_rad, self.world.target + self.world.stride_rad)
         self.world.commands.append(sent)
         self.world.target = sent
@@ -162,7 +162,7 @@ class FakeGripper(_Device):
         return self.stamped(GripperState(width_m=self.world.width_m, force_n=0.0, is_moving=moving, is_holding=False))
 
     def command(self, *, width_m: float, force_n: float, speed_m_per_s: float, deadline: Deadline) -> float:
-        self.stamped(None)  # one that is silent or broken takes no command
+        self.stamped(None)  # raises if the device is silent or broken, because it accepts no command then
         self.world.width_target_m = width_m
         return width_m
 
@@ -181,7 +181,7 @@ class FakeForceTorque(_Device):
         if self.name not in self.world.repeating:
             self._kept = self.world.wrench() + 1e-9 * (
                 self.world.ticks % 2
-            )  # the least that a live sensor's noise does
+            )  # the smallest change by the noise of a working sensor
         w = self._kept
         return self.stamped(Wrench(force_n=w[:3], torque_nm=w[3:]))
 
@@ -216,7 +216,7 @@ class FakeProximity(_Device):
 
 @dataclass
 class Rig:
-    """A controller over a `World`."""
+    """Controller of a `World`."""
 
     world: World
     controller: Controller
@@ -224,7 +224,7 @@ class Rig:
 
 
 def make_rig(*, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25) -> Rig:
-    """A started controller; close `rig.controller` at the end."""
+    """Return a started controller; the caller must close `rig.controller`."""
     world, latched = World(), [False]
     controller = Controller(
         MotionDevices(
@@ -247,5 +247,5 @@ def make_rig(*, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25)
 
 
 def tool_pose(q: np.ndarray) -> RigidTransform:
-    """base_from_grip for joints."""
+    """Return base_from_grip for joint positions."""
     return FRAMES.tool(q, GRIP)

@@ -1,4 +1,4 @@
-"""The compiled loops are ready before somebody waits for them, and each is compiled once only."""
+"""The compiled loops are ready before a user waits for them, and each is compiled only once."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from tests.manipulation.rig import GRIP, HOME, make_rig, tool_pose
 
 
 def signatures() -> dict[str, int]:
-    """How often each compiled loop of the package was compiled or loaded, by its name."""
+    """Return how often each compiled loop of the package was compiled or loaded, by name."""
     modules = [module for name, module in sys.modules.items() if name.startswith("manipulation.")]
     loops = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
     return {f"{loop.py_func.__module__}.{loop.py_func.__name__}": len(loop.signatures) for loop in loops}
 
 
 def a_pressed_path() -> CartesianPath:
-    """A yielding move of the tips with a guard of each quantity that is computed by a compiled loop."""
+    """Return a compliant move of the tips with a guard of each quantity that a compiled loop computes."""
     start = tool_pose(HOME)
     guards = (
         Guard(name="turn", quantity=Quantity.ROTATION, limit=3.0),

@@ -1,4 +1,4 @@
-"""The proof that no other pose fits better: the quadratic form, its multipliers, and what they may certify."""
+"""Tests of the proof that no other pose fits better: the quadratic form, its multipliers, and the certificates."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_every_pose_obeys_the_constraints() -> None:
 
 
 def lifted(p: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The problem's quadratic form frozen at its true pose, and that pose."""
+    """Return the problem's quadratic form, with directions fixed at the true pose, and that pose."""
     R, t = matrix_of(p.base_from_object), np.array(p.base_from_object.translation)
     return quadratic_forms(pack(p.measurements), R, t, np.zeros(3), np.zeros(3), 1.0), R, t
 

@@ -1,4 +1,4 @@
-"""The nine local pose functions against brute force, finite differences and known special cases."""
+"""Compares the nine local pose functions with brute force, finite differences and known special cases."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CLASSES = list(SensingClass)
 
 
 def random_measurement(cls: SensingClass, rng: np.random.Generator) -> Measurement:
-    """SPD C and rank-two M over three decades, any feature and place."""
+    """Return a random measurement: SPD C and rank-two M over three decades, any feature and position."""
     A, B = Rotation.random(2, rng=rng).as_matrix()
     u = rng.normal(size=3)
     return Measurement(
@@ -49,9 +49,10 @@ def test_agrees_with_brute_force_to_nine_digits(cls: SensingClass) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(CLASSES))
 def test_gradient_is_that_of_finite_differences(seed: int, cls: SensingClass) -> None:
-    """f is the least of smooth functions, one per minimum over v: its slope may fall at a kink but never rise.
+    """f is the minimum of smooth functions, one per minimum over v, so its slope may decrease at a kink but never rise.
 
-    So in every direction the forward slope is at most the gradient and the backward slope at least: equal where f is smooth.
+    Therefore, in every direction the forward slope is at most the gradient and the backward slope is at least the
+    gradient; they are equal where f is smooth.
     """
     rng = np.random.default_rng(seed)
     m, pose = random_measurement(cls, rng), random_pose(rng)
@@ -65,9 +66,9 @@ def test_gradient_is_that_of_finite_differences(seed: int, cls: SensingClass) ->
 
 
 def test_the_long_valleys_of_line_point_are_followed_to_their_end() -> None:
-    """A poorly known point and a direction that is sharp one way only: Newton's method once stopped on the slope.
+    """With an uncertain point and a direction that is precise in one way only, Newton's method may stop on the slope.
 
-    Seeds of a search for gradients that disagree with finite differences; 27 of 1500 random problems did.
+    The seeds are from a search for gradients that disagree with finite differences, as in 27 of 1500 random problems.
     """
     for seed in (69, 95, 169, 202):
         rng = np.random.default_rng(seed)
@@ -98,7 +99,7 @@ def test_noise_alone_gives_the_chi_square_of_the_class(code: str) -> None:
     made = [problem([code], rng) for _ in range(150)]
     f = np.array([local_values(p.measurements, p.base_from_object)[0] for p in made])
     dof = made[0].measurements[0].dof
-    # The mean of 150 chi-square values has a deviation of sqrt(2 dof / 150); four of those.
+    # The mean of 150 chi-square values has a standard deviation of sqrt(2 dof / 150); the limit is four of these.
     assert f.mean() == pytest.approx(dof, abs=4 * np.sqrt(2 * dof / len(f)))
 
 

@@ -1,4 +1,4 @@
-"""The compiled rows against the table of rows in numpy, for any matrices and any pose."""
+"""Compares the compiled residuals with the table of residuals in numpy, for any matrices and any pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_the_compiled_rows_are_those_of_the_table(cls: SensingClass) -> None:
     expected = [residual(m, R, t) @ residual(m, R, t) for m in given]
     found = np.empty(len(given))
     values(pack(given), R, t, NEAR, found)
-    assert found == pytest.approx(expected, rel=1e-3)  # a millionth of the direction's variance is floor
+    assert found == pytest.approx(expected, rel=1e-3)  # the direction's variance has a floor of 1e-6 of it
 
 
 @pytest.mark.parametrize("far", [NEAR, FAR])

@@ -1,4 +1,4 @@
-"""What an answer says of other poses, of repeated measurements, and of agreement against chance."""
+"""Tests of what an answer reports about other poses, repeated measurements, and agreement by chance."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from tests.fusion.mixtures import mixture
 
 
 def leaning(*sigmas_m: float) -> list[Measurement]:
-    """Two marks and a third known to lie in a plane only, so that the pose turned over about the first two fits as well;
-    then rough places of the third, which speak for one of the two.
+    """Return two marks and a third of which only a plane is known, so the pose flipped about the first two also fits;
+    then rough positions of the third, which favour one of the two poses.
     """
     pose = transform(np.eye(3), (0.5, 0.1, 0.3))
     C = 0.0005**2 * np.eye(3)

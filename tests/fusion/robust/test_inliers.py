@@ -1,4 +1,4 @@
-"""Branch and bound over which measurements to believe, against every set there is."""
+"""Compares branch and bound over the sets of inliers with the search of all sets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def packed(codes: list[str], seed: int, bad: int) -> tuple[Batch, np.ndarray, Lo
 
 
 def least_of_all_sets(b: Batch, used: np.ndarray, local: LocalSolution) -> float:
-    """min over all 2^N sets of min over poses, each from several starts: slow, and with no bound anywhere."""
+    """Return the minimum over all 2^N sets and all poses, each from several starts; slow, but without bounds."""
     lever, size = middle_and_size(b, used, local.rotation)
     about, middle = local.rotation.T @ lever, local.translation_m + lever
     forms = quadratic_forms(b, local.rotation, local.translation_m, about, middle, size)

@@ -1,4 +1,4 @@
-"""The entry point: right pose, honest covariance, mismatches named, mirrors and prior told."""
+"""Tests of `fuse`: right pose, consistent covariance, mismatches named, mirror poses and prior reported."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_mismatches_are_found_and_named(count: int, bad: int) -> None:
             assert is_near(p, answer.pose)
             assert p.bad <= {r.index for r in answer.rejected}
             assert len(answer.rejected) <= bad + 1
-        # With half of them wrong, as many may agree on another pose by accident: then the right one is listed too.
+        # If half of them are wrong, as many may agree on another pose by chance; then the right one is listed, too.
         assert is_near(p, answer.pose) or any(is_near(p, a.pose) for a in answer.alternatives)
         assert all(r.value > r.limit and r.reason == "mismatch" for r in answer.rejected)
 
@@ -62,7 +62,7 @@ def test_covariance_is_honest() -> None:
 
 @pytest.mark.parametrize("seed", [74, 140, 153, 198, 199, 216, 223])
 def test_no_good_measurement_is_given_up_for_a_worse_sum(seed: int) -> None:
-    """Elongated covariances: all agree near the truth, yet a set one short has a minimum of its own close by."""
+    """With elongated covariances all measurements agree near the truth, but a set without one has a minimum nearby."""
     rng = np.random.default_rng(seed)
     p = problem([CODES[k] for k in rng.integers(len(CODES), size=12)], rng, anisotropy=100.0)
     believing_all = solve(p.measurements, p.base_from_object)
@@ -85,12 +85,12 @@ def test_order_does_not_matter() -> None:
 
 
 def test_points_on_a_line_of_symmetry_leave_a_mirror() -> None:
-    """Two stereo points and a plane through both fit the pose turned over about the line through the points."""
+    """Two stereo points and a plane through both also fit the pose flipped about the line through the points."""
     pose = transform(np.eye(3), (0.5, 0.1, 0.3))
     C = 0.0005**2 * np.eye(3)
     features = [point((0, 0, 0)), point((0.4, 0, 0)), point((0.1, 0.2, 0.0))]
     given = [measurement(f, Kind.POINT, mu_m=pose.apply(f.point_m), C_m2=C) for f in features[:2]]
-    # The third point is only known to lie in the plane y = const of its true place: above or below the line both fit.
+    # Of the third point only the plane y = const is known, so positions above and below the line both fit.
     M = 1e6 * (np.eye(3) - np.diag([0.0, 1.0, 0.0]))
     off = point((0.1, 0.2, 0.1))
     given.append(measurement(off, Kind.PLANE, mu_m=pose.apply(off.point_m), C_m2=C, M=M))

@@ -1,4 +1,4 @@
-"""Measures of an object come out with its pose, and wrong touches are named."""
+"""The dimensions of an object are found together with its pose, and wrong touches are named."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_what_cannot_be_proven_of_a_shape_is_refused_not_left_out(proof: dict[st
 
 
 def touched_box() -> tuple[list[Measurement], UncertainPose, Box]:
-    """Two touches on each face of a box at the origin, on its true faces; a believed pose; the box as it is believed."""
+    """Return two touches on each true face of a box at the origin, a prior of the pose, and the assumed box."""
     guess = Box(size_m=(0.2, 0.1, 0.04))
     half, touches = np.array(guess.size_m) / 2, []
     for part in ("+x", "-x", "+y", "-y", "+z", "-z"):
@@ -105,6 +105,6 @@ def test_a_shape_knows_its_parts() -> None:
 
 @pytest.mark.parametrize(("sigma_m", "dof"), [(0.02, 9), (1e-6, 12)])
 def test_measures_that_the_touches_tell_cost_degrees_of_freedom(sigma_m: float, dof: int) -> None:
-    touches, prior, guess = touched_box()  # twelve constraints, and the prior's six for the pose
+    touches, prior, guess = touched_box()  # twelve constraints, and six of the prior on the pose
     answer = fuse(touches, prior=prior, shape=replace(guess, sigma_m=sigma_m))
     assert answer.dof == dof

@@ -1,4 +1,4 @@
-"""What a sensor's own errors become in C and M: each sigma in its own direction, places where they are known best."""
+"""Tests of how a sensor's errors enter C and M: each sigma in its direction, lines at the point known best."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def turned(x: Array) -> Rotation:
 
 
 def far_along_the_line(x: Array) -> tuple[Array, Array]:
-    """A line known best at PIVOT, told by a place half a metre from there."""
+    """Return a line that is known best at PIVOT, described by a point half a metre away."""
     d = turned(x).apply(D)
     return PIVOT + x[:3] + 0.5 * d, d
 

@@ -1,4 +1,4 @@
-"""Each sense's measurement: the class it makes, zero misfit without noise, chi-square with noise of every source."""
+"""Tests of each sense's measurement: its class, zero residual without noise, chi-square with noise of every source."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POINT, LINE, PLANE = point((0.1, 0.2, 0.0)), line((0.1, 0.2, 0.0), (1, 0, 0)), p
 
 
 class Scene:
-    """An object, two cameras and a finger about it; `noise` 1 draws every error, 0 none."""
+    """Object with two cameras and a finger around it; `noise` 1 draws every error, 0 none."""
 
     def __init__(self, seed: int, noise: float) -> None:
         self.rng, self.noise = np.random.default_rng(seed), noise
@@ -38,7 +38,7 @@ class Scene:
         return transform(np.column_stack([x, np.cross(z, x), z]), self.x + offset)
 
     def uncertain(self, true: RigidTransform) -> UncertainPose:
-        """The pose as the arm knows it."""
+        """Return the pose with the arm's error."""
         return UncertainPose(
             parent_from_child=perturbed(true, -self.noise * self.rng.normal(0, POSE_SIGMA)),
             covariance=np.diag(POSE_SIGMA**2),
@@ -100,7 +100,7 @@ def test_without_noise_the_true_pose_fits_exactly(sense: Callable[[Scene], Measu
         scene = Scene(seed, 0.0)
         made = sense(scene)
         assert made.cls == SENSES[sense]
-        assert local_value(made, scene.pose) < 1e-7  # M of 1e6 and more times the rounding of a unit vector
+        assert local_value(made, scene.pose) < 1e-7  # M of 1e6 and more times the rounding error of a unit vector
 
 
 @pytest.mark.parametrize("sense", SENSES, ids=lambda f: f.__name__)

@@ -1,4 +1,4 @@
-"""Motions that no measurement sees: named in words, as a twist, and with a standard deviation about the features."""
+"""Unobservable motions are described in words and as a twist, with a standard deviation at the features."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def blind_to(twist: Array) -> Array:
-    """Information (6, 6) about every motion but one."""
+    """Return the information (6, 6) about all motions except one."""
     unit = twist / np.linalg.norm(twist)
     return 1e8 * (np.eye(6) - np.outer(unit, unit))
 
@@ -27,7 +27,7 @@ def blind_to(twist: Array) -> Array:
 def test_a_free_turn_about_the_middle_is_named_with_its_slide(rise_m_per_rad: float) -> None:
     twist = np.concatenate(
         [np.cross(CENTRE, AXIS) + rise_m_per_rad * AXIS, AXIS]
-    )  # of the origin, which the turn carries
+    )  # of the origin, which moves with the rotation
     covariance, (free,) = covariance_and_freedom(blind_to(twist), CENTRE, 0.2)
     assert abs(free.twist @ twist) == pytest.approx(np.linalg.norm(twist))
     slide = f" while sliding {1000 * np.radians(rise_m_per_rad):.1f} mm per degree" if rise_m_per_rad else ""

@@ -42,7 +42,7 @@ def test_the_jacobian_is_the_derivative_of_the_tool_pose(arm: ArmCapabilities, q
 @ARMS
 def test_every_branch_of_the_inverse_reaches_the_pose_and_one_is_the_start(arm: ArmCapabilities) -> None:
     kinematics, rng = Kinematics.of(arm), np.random.default_rng(3)
-    count = 100 if arm is T3 else 8  # two turns in each joint make some 500 branches of the second arm
+    count = 100 if arm is T3 else 8  # two turns per joint give the second arm about 500 solution branches
     for q in rng.uniform(kinematics.lower_rad, kinematics.upper_rad, (count, 6)):
         pose = kinematics.flange(q)
         found = kinematics.inverse(pose)
@@ -132,7 +132,7 @@ def test_a_wrench_does_the_same_work_in_either_frame(
 ) -> None:
     parent_from_child = RigidTransform.from_components(d, Rotation.from_rotvec(r))
     seen = control_kernels.wrench_at(np.concatenate([f, t]), parent_from_child.inv().as_matrix())
-    # Virtual work of a rigid motion (v, w) of the body, given at the parent's origin and at the child's.
+    # Virtual work of a rigid motion (v, w) of the body, expressed at the parent's origin and at the child's.
     for v, w in ((np.array([1.0, 2.0, -1.0]), np.array([0.3, -0.2, 0.5])), (np.zeros(3), np.array([1.0, 0.0, 2.0]))):
         at_child = v + np.cross(w, d)
         inverse = parent_from_child.rotation.inv()
@@ -150,7 +150,7 @@ def test_admittance_settles_at_force_over_stiffness_and_rigid_axes_stay() -> Non
         control_kernels.admittance_step(state, wrench, stiffness, damping, mass, bound, 0.002)
     assert state[0, 0] == pytest.approx(0.01, rel=1e-3)
     assert state[0, 1] == 0.0
-    assert state[0, 2] == 0.05  # a free axis drifts to its bound and stays there
+    assert state[0, 2] == 0.05  # an axis without stiffness drifts to its bound and stays there
 
 
 @given(speed=st.floats(0.0, 50.0))

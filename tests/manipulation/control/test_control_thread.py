@@ -1,4 +1,4 @@
-"""The thread that does what callers hand over."""
+"""Tests of the thread that runs the work of callers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PATIENCE_S = 10.0
 
 
 def quiet() -> None:
-    """Nothing."""
+    """Do nothing."""
 
 
 @pytest.mark.parametrize("beats", [False, True])

@@ -179,7 +179,7 @@ def test_too_much_force_is_a_fault_in_any_motion(rig: Rig) -> None:
 
 
 def test_a_frozen_force_sensor_ends_a_motion_before_the_wall_is_pressed_hard(rig: Rig) -> None:
-    """Nothing noticed, and the arm went on to 1029 N in a mission."""
+    """Without this check a mission pressed with 1029 N."""
     rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.01
     rig.world.repeating.add("wrist_ft")
     report = rig.controller.execute(forwards(0.1))
@@ -202,7 +202,7 @@ def test_an_arm_that_does_not_follow_is_a_fault(rig: Rig) -> None:
 
 
 def frozen_in_motion(rig: Rig) -> None:
-    """The arm goes on while it repeats one reading under new stamps, until that is noticed."""
+    """Let the arm move while it repeats one reading with new stamps, until the controller detects it."""
     rig.world.before_step = lambda: rig.world.repeating.add("arm") if rig.world.ticks == 300 else None
     report = rig.controller.execute(forwards(0.1))
     assert (report.tripped, report.device) == ("tracking", "arm")
@@ -216,7 +216,7 @@ def test_an_arm_that_failed_is_left_to_its_own_brake(rig: Rig) -> None:
 
 
 def test_an_arm_whose_reading_is_still_wrong_is_not_sent_there_after_a_reset(rig: Rig) -> None:
-    """It leapt the 22 mm back at once: the first set-point of the next motion was the wrong reading."""
+    """Otherwise the arm would jump back by 22 mm, because the next motion begins at the wrong reading."""
     frozen_in_motion(rig)
     stood = rig.world.q.copy()
     rig.world.stride_rad = 0.006
@@ -239,7 +239,7 @@ def test_an_arm_that_is_well_again_goes_on_from_where_it_is(rig: Rig) -> None:
 
 @pytest.mark.parametrize("act", ["motion", "tare"])
 def test_an_arm_that_says_it_is_not_where_it_was_held_is_not_sent_there(rig: Rig, act: str) -> None:
-    """A bias of 20 mrad on all joints, come between two motions, made each motion begin with a leap."""
+    """A bias of 20 mrad on all joints that appears between two motions would make each motion begin with a jump."""
     assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
     rig.world.commands.clear()
     rig.world.bias_rad = 0.02
@@ -258,7 +258,7 @@ def test_compliance_yields_to_the_wall(rig: Rig) -> None:
     rig.world.wall_x_m = float(tool_pose(HOME).translation[0]) + 0.02
     soft = Compliance(stiffness=(300.0,) * 3 + (INF,) * 3, damping=(100.0,) * 6, mass=(2.0,) * 6)
     report = rig.controller.execute(forwards(0.04, speed=0.02, compliance=soft))
-    # 20 mm beyond the wall: the series of 300 and 5000 N/m carries 5.7 N, where a stiff arm would press 100 N.
+    # 20 mm beyond the wall, springs of 300 and 5000 N/m in series press with 5.7 N; a stiff arm would press with 100 N.
     assert report.outcome is MotionOutcome.COMPLETED
     assert np.linalg.norm(report.wrench[:3]) == pytest.approx(0.02 / (1 / 300 + 1 / 5000), rel=0.15)
 
@@ -320,9 +320,9 @@ def test_a_stop_between_motions_switches_the_drives_off_though_a_device_is_dead(
     assert rig.controller.execute(Hold(name="still", duration_s=0.02)).outcome is MotionOutcome.COMPLETED
     assert rig.world.enabled
     rig.world.silent.add(dead)
-    rig.world.clock.sleep(1.0)  # longer than anybody's patience
+    rig.world.clock.sleep(1.0)  # longer than all time limits
     rig.latched[0] = True
-    rig.controller._hold()  # what the control thread does each tick on a wall clock
+    rig.controller._hold()  # as the control thread does in each tick on a wall clock
     assert not rig.world.enabled
 
 
@@ -331,7 +331,7 @@ def test_after_a_stop_the_first_set_point_is_the_measured_position(rig: Rig) -> 
     rig.controller.execute(forwards(0.1))
     rig.latched[0] = False
     rig.world.before_step = lambda: None
-    moved = rig.world.q + 0.1  # somebody jogged the arm meanwhile
+    moved = rig.world.q + 0.1  # the arm was moved by hand meanwhile
     rig.world.q = rig.world.target = moved
     rig.world.commands.clear()
     rig.controller.execute(Hold(name="still", duration_s=0.02))
@@ -352,7 +352,7 @@ def test_a_motion_that_begins_while_the_controller_closes_is_cancelled_too(rig: 
         if rig.world.ticks == 150:
             closing.start()
             assert rig.controller._cancel.wait(10.0)
-            rig.controller._cancel.clear()  # as `execute` does, if it comes between the cancel and the thread's end
+            rig.controller._cancel.clear()  # as `execute` does if it runs between the cancel and the thread's end
 
     rig.world.before_step = close
     report = rig.controller.execute(forwards(0.1))

@@ -1,4 +1,4 @@
-"""The arm's drives under the control thread: the rhythm of set-points, and a stop that always goes through."""
+"""Tests of the arm's drives under the control thread: timing of set-points, and a stop that always succeeds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DT_S = 0.002
 
 
 class Wall(WallClock):
-    """A wall whose time is a number; a sleep takes as long as was asked, and `late_s` more."""
+    """Fake wall clock; a sleep takes `late_s` longer than requested."""
 
     def __init__(self) -> None:
         self.time_s = 100.0
@@ -30,7 +30,7 @@ class Wall(WallClock):
 
 
 class ArmOf:
-    """An arm that notes what it is asked for and fails as it is told."""
+    """Arm that records its calls and fails as configured."""
 
     name = "arm"
 

@@ -1,4 +1,4 @@
-"""Where each kind of motion wants the arm in a tick, when it is over, and what the report keeps of it."""
+"""Tests of each kind of motion: its set-points per tick, its end, and its report."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def tick(
 
 
 def test_a_trajectory_starts_at_the_measured_joints_and_has_closed_the_gap_after_a_quarter_second() -> None:
-    """The declared course is a parabola, which a cubic between its points repeats exactly."""
+    """The trajectory is a parabola, which cubic interpolation between its points reproduces exactly."""
     times, rate = np.array([0.0, 0.3, 1.0]), np.linspace(0.1, 0.6, 6)
     motion = JointTrajectory(
         name="joints",
@@ -70,7 +70,7 @@ def test_a_trajectory_starts_at_the_measured_joints_and_has_closed_the_gap_after
 
 
 def a_path(compliance: Compliance | None = None) -> CartesianPath:
-    """Half a second of 40 mm along the base's z, begun at `HOME`."""
+    """Return a path from `HOME` of 40 mm along the base's z in half a second."""
     start = tool_pose(HOME)
     poses = tuple(perturbed(start, np.array([0, 0, z, 0, 0, 0])) for z in (0.0, 0.02, 0.04))
     return CartesianPath(
@@ -82,7 +82,7 @@ def a_path(compliance: Compliance | None = None) -> CartesianPath:
 def followed(
     run: Executor, until_s: float, start_rad: np.ndarray, wrench: np.ndarray | None = None
 ) -> list[np.ndarray]:
-    """Set-points of each tick from 0 to `until_s`, each taken as it is wanted."""
+    """Return the set-points of each tick from 0 to `until_s`; each is reached at once."""
     joints = [start_rad]
     for k in range(round(until_s / DT_S) + 1):
         joints.append(run.wanted(tick(k * DT_S, last_rad=joints[-1], wrench=wrench)))
@@ -125,7 +125,7 @@ def test_a_compliant_path_yields_by_force_over_stiffness_along_the_tools_own_axi
 
 
 def test_an_admittance_moves_as_mass_damper_and_spring_do_towards_its_target_wrench() -> None:
-    """Against the closed form of the overdamped oscillator; the step is of first order, so to about 1 %."""
+    """Compares with the closed form of the overdamped oscillator, to 1 % because the integration is of first order."""
     m, d, k, f = 2.0, 80.0, 500.0, 4.0
     six = (k, INF, k, k, k, k)
     pull = Compliance(stiffness=six, damping=(d,) * 6, mass=(m,) * 6, target_wrench=(-1.0, 0, 0, 0, 0, 0))
@@ -158,7 +158,7 @@ def test_an_admittance_yields_no_further_than_its_bound_and_comes_back(axis: int
 
 
 class Pads:
-    """A gripper that keeps what it was told."""
+    """Gripper that records its commands."""
 
     name = "gripper"
 

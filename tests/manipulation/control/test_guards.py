@@ -1,4 +1,4 @@
-"""Guards one by one: what each measures, at which tick it trips, and what does not trip it."""
+"""Tests of each guard: what it measures, in which tick it trips, and what does not trip it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BEYOND = 1e-9
 
 
 def measured(**given: Any) -> Measured:
-    """A tick at the start pose in which nothing is felt."""
+    """Return a tick at the start pose without contact."""
     quiet: dict[str, Any] = {
         "elapsed_s": 0.0,
         "wrench": np.zeros(6),
@@ -32,7 +32,7 @@ def measured(**given: Any) -> Measured:
 
 
 def moved(shift_m: tuple[float, float, float], turn_rad: float = 0.0) -> dict[str, Any]:
-    """The tool shifted in base axes and turned about base x; commanded where it started."""
+    """Return a tick with the tool shifted in base axes and rotated about base x, but commanded to its start pose."""
     pose = RigidTransform.from_components(
         START.translation + shift_m, Rotation.from_rotvec([turn_rad, 0.0, 0.0]) * START.rotation
     )
@@ -108,7 +108,7 @@ def test_the_first_of_two_guards_is_named_and_both_keep_count() -> None:
 
 
 def look(force_n: float = 0.0, *, behind_m: float = 0.0) -> ToolReading:
-    """A tick with a push along -z and a tool that lags behind."""
+    """Return a tick with a force along -z and a tool that lags behind its command."""
     return ToolReading(
         wrench=np.array([0.0, 0.0, -force_n, 0.0, 0.0, 0.0]),
         base_from_tool=START.as_matrix(),
@@ -137,7 +137,7 @@ def watch(
 
 
 def endings(watched: TerminationMonitor, seen: ToolReading, ticks: int) -> list[MotionOutcome | None]:
-    """What each tick says."""
+    """Return the result of each tick."""
     found = [watched.ending(0.002 * tick, SAMPLE, seen) for tick in range(ticks)]
     return [None if end is None else end.outcome for end in found]
 

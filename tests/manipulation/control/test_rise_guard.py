@@ -1,4 +1,4 @@
-"""The guard that finds an end stop: neither fooled by a load that is taken up again, nor late for a stop."""
+"""The guard that detects an end stop does not trip when a load is taken up again, and is not late for a stop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POSE = np.eye(4)
 
 
 def trips_at_s(force_n: Callable[[float], float], *, rise_n: float, until_s: float = 2.0) -> float | None:
-    """When a guard on a rise trips over a force along x."""
+    """Return when a guard on a force rise trips for a force along x; None if it does not."""
     guards = GuardSet((Guard(name="stop", quantity=Quantity.FORCE_RISE, limit=rise_n, axis=(1.0, 0.0, 0.0)),), POSE)
     for tick in range(round(until_s / DT_S)):
         elapsed_s = tick * DT_S
@@ -33,7 +33,7 @@ def trips_at_s(force_n: Callable[[float], float], *, rise_n: float, until_s: flo
 
 
 def test_taking_up_the_load_of_the_motion_before_is_no_end_stop() -> None:
-    """Friction of 40 N, of which half had gone when the arm stood; an arm behind a wire begins 50 ms late."""
+    """Half of a friction of 40 N is lost while the arm stands; an arm on a link starts to move 50 ms late."""
 
     def taken_up(late_s: float) -> Callable[[float], float]:
         return lambda t: 20.0 + 20.0 * min(max(t - late_s, 0.0) / 0.08, 1.0)

@@ -79,7 +79,7 @@ def test_a_tick_waits_long_for_a_device_only_where_the_world_waits_too() -> None
 
 
 class Wall(WallClock):
-    """A wall whose time is a number."""
+    """Fake wall clock."""
 
     time_s = 100.0
 
@@ -91,7 +91,7 @@ class Wall(WallClock):
 
 
 class LateArm(FakeArm):
-    """What it says is old until a moment."""
+    """Arm whose readings are old until a given time."""
 
     def __init__(self, clock: Clock, *, fresh_at_s: float, quality: Quality = Quality.VALID) -> None:
         super().__init__("arm", World())
@@ -113,10 +113,10 @@ def devices_with(arm: FakeArm, clock: Clock) -> Devices:
 
 
 def test_an_old_reading_of_the_arm_is_waited_out_on_a_wall() -> None:
-    """One reading of 0.1 s on a busy machine latched the stop."""
+    """Otherwise one reading 0.1 s old, on a busy machine, would latch the stop."""
     clock = Wall()
     arm = LateArm(clock, fresh_at_s=100.0 + 0.5 * STALE_WAIT_S)
-    with pytest.raises(DeviceFailure, match=r"^gripper"):  # the arm has answered; the gripper's world has another clock
+    with pytest.raises(DeviceFailure, match=r"^gripper"):  # the arm has answered; the gripper's clock is another one
         devices_with(arm, clock).read()
     assert clock.time_s == pytest.approx(arm.fresh_at_s, abs=2 * STALE_STEP_S)
 

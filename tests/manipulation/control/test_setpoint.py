@@ -1,4 +1,4 @@
-"""What the checks before a motion let through and refuse, each at its bound, and what the last filter sends."""
+"""Tests of the checks before a motion, each at its limit, and of the set-points that the final filter sends."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ GRASP = GripperMotion(name="grasp", width_m=0.01, force_n=1.0)
 
 
 def with_joint(array: np.ndarray, row: int, value: float) -> np.ndarray:
-    """A copy with another number for the last joint of a row."""
+    """Return a copy with another value for the last joint of one row."""
     out = array.copy()
     out[row, -1] = value
     return out
 
 
 def shifted(*six: float) -> CartesianPath:
-    """The path begun beside the tool: m, then rad."""
+    """Return the path shifted from the tool's pose by m and rad."""
     return replace(PATH, base_from_tool=(perturbed(POSE, np.array(six)), POSE))
 
 
@@ -169,11 +169,11 @@ def test_the_filter_sends_nothing_beyond_the_joint_range_nor_above_the_speed_of_
 
 VELOCITY, ACCELERATION = np.array(T3.velocity_rad_per_s), np.array(T3.acceleration_rad_per_s2)
 FREE_TIP_M_PER_S = 10.0
-A_SHORT_LEAP_RAD = 5e-4  # one that is over within the ticks that are looked back on is taken for a course: v^2 / 2a
+A_SHORT_LEAP_RAD = 5e-4  # a jump completed within the ticks looked back on counts as a trajectory: v^2 / 2a
 
 
 def driven(made: SetPointLimiter, wanted: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N + 1, 6) and accelerations (N, 6) that the filter makes of a course."""
+    """Return positions (N + 1, 6) and accelerations (N, 6) of the filter for a trajectory."""
     ways, speeds = [made.last_rad], [made.velocity_rad_per_s]
     for joints in wanted:
         made.sent(made.apply(joints))
@@ -193,7 +193,7 @@ def test_behind_a_leap_the_arm_brakes_in_time_and_rests_where_it_was_wanted(
     joints, accelerations = driven(made, itertools.repeat(goal, 3500))
     np.testing.assert_allclose(joints[-2:], [goal, goal], atol=1e-9)
     past_rad = ((joints - goal) * np.sign(leap)).max()
-    if is_tip_limited:  # joints that slow down together for the tip may run a little past; 0.3 rad without the brake
+    if is_tip_limited:  # the limit of the tip slows all joints, so some overshoot slightly; without braking 0.3 rad
         assert past_rad <= 0.1
     else:
         assert past_rad <= A_SHORT_LEAP_RAD
@@ -218,7 +218,7 @@ def test_a_course_within_the_limits_is_sent_as_it_is_whatever_it_does(seed: int)
     for push in rng.uniform(-1.0, 1.0, (10, 6)).repeat(40, axis=0):
         speed = np.clip(speed + push * ACCELERATION * DT_S, -VELOCITY, VELOCITY)
         course.append(course[-1] + speed * DT_S)
-    assume(np.abs(course).max() < UPPER - 0.2)  # where it can still brake ahead of its range
+    assume(np.abs(course).max() < UPPER - 0.2)  # leaves space to brake before the joint limit
     joints, _ = driven(made_filter(), course[1:])
     np.testing.assert_allclose(joints, course, atol=1e-9)
 
@@ -232,7 +232,7 @@ def test_a_set_point_that_was_held_back_catches_up_with_a_course_that_slows_down
 
 
 def test_ticks_that_come_late_and_early_cost_a_steady_course_no_more_than_their_own_error() -> None:
-    """A tenth of a period at up to 0.56 rad/s is 0.11 mrad; looking back on one tick only, 1 mrad was lost."""
+    """A tenth of a period at up to 0.56 rad/s is 0.11 mrad; with a look-back of one tick only the error is 1 mrad."""
     rng = np.random.default_rng(3)
     u = np.clip((np.arange(1100) + rng.uniform(-0.1, 0.1, 1100)) * DT_S / 2.0, 0.0, 1.0)
     course = HOME + 0.6 * (u**3 * (10.0 - 15.0 * u + 6.0 * u**2))[:, None] * np.ones(6)
@@ -255,7 +255,7 @@ def test_a_brake_slows_every_joint_as_fast_as_it_may_whatever_was_wanted_last(le
 
 
 def test_at_the_speed_limit_of_the_tip_no_joint_brakes_harder_than_it_may() -> None:
-    """Scaled to the limit alone, wrists that turned fast were braked seven times as hard as they may be."""
+    """If speeds were only scaled to the limit, fast wrists would be braked at seven times the allowed acceleration."""
     rng = np.random.default_rng(7)
     goals = HOME + np.repeat(rng.uniform(-0.6, 0.6, (50, 6)), 30, axis=0)
     _, accelerations = driven(made_filter(tip_limit_m_per_s=0.25), goals)

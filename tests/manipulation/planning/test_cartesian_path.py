@@ -23,7 +23,7 @@ def test_a_ramped_move_ends_in_place_and_keeps_speed_and_ramp(way: float, speed:
     assert s[0] == 0.0 and s[-1] == pytest.approx(way)
     assert np.all(v >= -1e-9) and np.all(v <= speed * 1.01)
     assert v[0] <= 0.5 * t[1] and v[-1] <= 0.5 * (t[-1] - t[-2]) + 1e-3
-    # From rest to rest with the ramp: never faster than the exact trapezoid or triangle.
+    # From rest to rest with ramps, it is never faster than the exact trapezoid or triangle.
     exact = way / speed + speed / 0.5 if way > speed**2 / 0.5 else 2 * np.sqrt(way / 0.5)
     assert t[-1] == pytest.approx(exact, rel=0.02)
 
@@ -57,7 +57,7 @@ def test_an_arc_keeps_its_distance_and_turns_with_the_radius(angle: float) -> No
     poses = arc(START, centre_m=centre, axis=axis, angle_rad=angle)
     radii = [np.linalg.norm(np.cross(pose.translation - centre, unit)) for pose in poses]
     assert np.ptp(radii) < 1e-12
-    # A point of the centre line does not move in the tool's axes: the tool is carried round rigidly.
+    # A point on the rotation axis does not move in tool axes, because the tool rotates rigidly about it.
     local = np.array([pose.inv().apply(centre) for pose in poses])
     assert np.ptp(local, axis=0).max() < 1e-12
     assert (poses[-1].rotation * START.rotation.inv()).as_rotvec() @ unit == pytest.approx(angle)

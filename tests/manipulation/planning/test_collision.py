@@ -65,7 +65,7 @@ def test_a_box_in_the_forearm_is_found_and_named() -> None:
 def test_an_ordinary_pose_does_not_touch_itself_and_a_folded_one_does() -> None:
     model = CollisionModel.build(KINEMATICS, TOOL)
     assert model.is_clear(np.array([0.0, 0.2, 0.5, 0.0, 0.9, 0.0]), margin_m=0.01)
-    # Forearm folded back along the upper arm and the wrist bent towards it.
+    # The forearm is folded back along the upper arm, and the wrist is bent towards it.
     folded = [np.array([0.0, 0.0, 1.6, 0.0, wrist, 0.0]) for wrist in np.linspace(-2.8, 2.8, 15)]
     assert min(model.clearance_m(q) for q in folded) < 0.0
 
@@ -163,7 +163,7 @@ def test_the_envelope_of_a_lever_follows_its_angle() -> None:
     lever = panel.object("valve")
     assert isinstance(lever, Lever)
     sideways = envelope(lever, angle_rad=np.pi / 2)
-    # Clockwise from up by a quarter turn points to +x.
+    # A quarter turn clockwise from up points to +x.
     assert sideways.parent_from_box.translation[0] == pytest.approx(lever.length_m / 2)
     assert sideways.parent_from_box.translation[1] == pytest.approx(0.0, abs=1e-9)
     sweep = envelope(lever)

@@ -1,4 +1,4 @@
-"""Where to touch: points of the plate that are bare and far apart."""
+"""Points to touch are on the bare plate and far apart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Short ways through places: the best one for few, a sensible one for many, none left out."""
+"""Visiting orders are optimal for few places, short for many, and leave out none."""
 
 from __future__ import annotations
 

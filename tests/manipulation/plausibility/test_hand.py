@@ -1,4 +1,4 @@
-"""Fingers and pads that answer, and answer what cannot be."""
+"""Tests of fingers and gripper pads whose readings are implausible."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ DT_S = 0.002
     ("begun_m", "sent_m", "said_m", "holding", "moving"),
     [
         (0.0, 0.034, 0.034, False, False),
-        (0.0, 0.034, 0.0315, False, False),  # as coarse as grippers are
+        (0.0, 0.034, 0.0315, False, False),  # within the accuracy of grippers
         (0.034, 0.0, 0.014, True, False),  # an object between the pads
-        (0.014, 0.0, 0.014, True, False),  # held already, and held more firmly
-        (0.034, 0.0, 0.020, False, True),  # slow pads on their way when the time was over
-        (0.014, 0.034, 0.030, True, False),  # open until something stopped them
+        (0.014, 0.0, 0.014, True, False),  # an object already held is gripped more firmly
+        (0.034, 0.0, 0.020, False, True),  # slow pads still moving at the time limit
+        (0.014, 0.034, 0.030, True, False),  # opening was stopped by an object
     ],
 )
 def test_what_a_healthy_gripper_says_is_believed(
@@ -98,7 +98,7 @@ def test_pads_that_say_they_did_not_move_end_the_motion_and_the_way_out_goes_on(
 
 
 class Hand:
-    """A hand whose fingers and wrist say what they are told to, tick by tick."""
+    """Hand whose fingers and wrist report given readings, tick by tick."""
 
     def __init__(self, *, threshold_n: float = 0.5) -> None:
         world = World()
@@ -137,7 +137,7 @@ def test_a_push_on_the_tips_that_the_fingers_do_not_feel_names_them() -> None:
 
 
 def test_what_was_told_is_told_again_only_when_the_hand_had_time_to_leave() -> None:
-    """It was told in every motion, so that the arm stayed where it pushed on a button with 14 N."""
+    """If it were reported in every motion, the arm could not leave a button that it pushes with 14 N."""
     hand = Hand()
     with pytest.raises(DeviceFailure):
         hand.feels(14.0, lasting_s=1.0, fingers=False)
@@ -170,7 +170,7 @@ def test_a_finger_that_says_contact_all_along_a_free_way_names_itself() -> None:
 
 def test_a_hand_that_carries_or_rubs_or_has_just_let_go_may_say_contact() -> None:
     Hand().closes().feels(1.0, lasting_s=1.0, fingers=True, way_m=1.0)
-    Hand().feels(1.0, lasting_s=1.0, fingers=True, way_m=1.0)  # nobody knows what it holds
+    Hand().feels(1.0, lasting_s=1.0, fingers=True, way_m=1.0)  # it is unknown what the hand holds
     Hand().opens().feels(6.0, lasting_s=1.0, fingers=True, way_m=1.0)
     hand = Hand().opens()
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""Proximity sensors over a touched plate: which are believed."""
+"""Tests of which proximity sensors are trusted over a plate that was touched."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ PANEL = load_panel(Path(__file__).parents[3] / "panels" / "bench.toml")
 SPOTS = touch_points(PANEL, 4)
 OF = ProximityCapabilities(min_range_m=0.02, max_range_m=0.6, sigma_m=0.0008, rate_hz=100.0)
 BASE_FROM_PANEL = transform_rpy((0.75, 0.1, 0.6), (np.pi / 2, 0.05, -np.pi / 2))
-BULGE_M = 0.002  # the plate stands so far before where the panel's pose has it
+BULGE_M = 0.002  # the plate is this far in front of its place by the panel's pose
 
 
 def over(spot: Sequence[float], height_m: float) -> RigidTransform:
-    """`base_from_sensor` that looks straight at a point of the plate from so far before it."""
+    """Return `base_from_sensor` that faces a point of the plate at a right angle from a given distance."""
     down = Rotation.from_euler("x", np.pi)
     return BASE_FROM_PANEL * RigidTransform.from_components([spot[0], spot[1], BULGE_M + height_m], down)
 
@@ -50,7 +50,7 @@ def visit(
     [
         ((0.15, 0.13), (0.15, 0.13), "says 1[35]0 mm where .* is 1[02]0 mm"),  # off by 30 mm
         ((0.12, 0.12), (0.12, 0.12), "says 120 mm where .* is 100 mm"),  # frozen over the plate
-        ((0.40, 0.40), (0.40, 0.40), "says 400 mm where .* is 100 mm"),  # frozen before
+        ((0.40, 0.40), (0.40, 0.40), "says 400 mm where .* is 100 mm"),  # frozen before it reached the plate
         ((math.nan, math.nan), (math.nan, math.nan), "sees nothing where .* is 120 mm"),
     ],
 )
@@ -69,7 +69,7 @@ def test_noise_and_what_hangs_before_the_plate_at_one_place_is_no_fault() -> Non
     for spot, said in zip([*SPOTS, *SPOTS], [(0.123, 0.097), (0.06, 0.04), (0.12, 0.1), (0.06, 0.04)] * 2, strict=True):
         visit(watch, spot, *said)
     watch = ProximityMonitor(PANEL)
-    for spot, nearer in zip(SPOTS, (0.03, 0.06, 0.02, 0.07), strict=True):  # cables, nowhere the same
+    for spot, nearer in zip(SPOTS, (0.03, 0.06, 0.02, 0.07), strict=True):  # cables at different heights
         visit(watch, spot, 0.12 - nearer, 0.1 - nearer)
 
 

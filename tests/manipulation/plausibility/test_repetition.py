@@ -1,4 +1,4 @@
-"""Sensors that repeat themselves, and those that may."""
+"""Tests of sensors that repeat their reading, and of those that may do so."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def wrench(force_n: float) -> np.ndarray:
 
 
 class Wrist(FakeForceTorque):
-    """Of any noise and rate."""
+    """Return a reading with any noise and rate."""
 
     def __init__(self, *, force_sigma_n: float = 0.3, rate_hz: float = 500.0) -> None:
         super().__init__("wrist_ft", World())
@@ -30,7 +30,7 @@ class Wrist(FakeForceTorque):
 
 
 def repeats_for_s(sensor: Wrist | None, *, every_s: float = 0.002, lasting_s: float = 2.0) -> float | None:
-    """How long one reading may repeat until it is a failure; None for ever."""
+    """Return how long one reading may be repeated before it counts as a failure; None if without limit."""
     watch = RepeatedWrench(sensor)
     for tick in range(round(lasting_s / every_s)):
         finding = watch.note(wrench(1.0), stamp_s=tick * every_s)

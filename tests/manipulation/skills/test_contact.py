@@ -1,4 +1,4 @@
-"""What skills conclude from a motion: outcomes, contact points, and when they try again."""
+"""Tests of what skills conclude from a motion: outcomes, contact points, and repetitions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def report(
 
 
 class ScriptedMover:
-    """Answers every motion with the same report and counts."""
+    """Mover that answers every motion with the same report and counts them."""
 
     def __init__(self, answer: MotionReport) -> None:
         self.answer = answer
@@ -218,7 +218,7 @@ def test_inertia_at_the_start_is_not_taken_for_a_surface() -> None:
 
 def test_an_onset_lies_between_the_start_of_the_move_and_the_first_force() -> None:
     depth = np.linspace(0.005, 0.01, 51)
-    force = 2.0 + 100.0 * (depth - 0.005)  # so soft that its line meets zero before the move began
+    force = 2.0 + 100.0 * (depth - 0.005)  # so soft that the fitted line reaches zero before the start of the move
     assert onset(depth, force, 0.01)[0] == 0.005
 
 

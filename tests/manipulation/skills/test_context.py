@@ -20,7 +20,7 @@ PARK = np.array([0.0, 0.0, -0.3, 0.0, 1.2, 0.0])
 
 
 class NoMover:
-    """A mover that must not be asked."""
+    """Mover that must not be used."""
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
         raise AssertionError("planning moves nothing")
@@ -92,5 +92,5 @@ def test_a_wider_hand_has_its_fingers_further_apart_and_the_same_body() -> None:
     assert wide["body_left"] == narrow["body_left"]
     for capsule in narrow.values():
         if capsule.name.startswith("finger"):
-            # The round end of the capsule reaches the tip and not beyond.
+            # The round end of the capsule reaches the tip and not further.
             assert capsule.end_m[2] + capsule.radius_m == pytest.approx(GRIP.translation[2])

@@ -1,4 +1,4 @@
-"""The skills on the simulated bench, with a panel pose that is 3 mm and 1 degree wrong; the simulator's truth judges."""
+"""The skills on the simulated bench with a panel pose wrong by 3 mm and 1 degree, judged by the simulator's truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_touch_finds_the_true_plate_although_the_pose_is_wrong(bench: SimBench
     point = touch_probe(bench.context, (0.0, 0.06, 0.0))
     true = bench.true_panel().inv().apply(point.point_m)
     believed = bench.context.panel_pose.inv().apply(point.point_m)
-    assert abs(true[2]) < 0.001  # the gripper's own mount is 0.2 mm and 0.9 mrad uncertain
+    assert abs(true[2]) < 0.001  # the gripper's mount has an uncertainty of 0.2 mm and 0.9 mrad
     assert abs(believed[2]) > abs(true[2])
     assert np.sqrt(point.normal @ point.covariance @ point.normal) < 0.001
     assert bench.peak_force_n() < 25.0

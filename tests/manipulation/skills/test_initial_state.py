@@ -1,4 +1,4 @@
-"""Where a skill's object stands, by what was seen of it."""
+"""Tests of the initial state of a skill's object, from what was seen of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The last part of a lever's stroke: what is an end stop, and what was only a bar that stuck and slipped."""
+"""Tests of the last part of a lever's stroke: an end stop is distinguished from stick-slip of the bar."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ SPAN_RAD = np.pi / 2
 AXIS = np.array([0.0, 0.0, -1.0])
 RADIUS_M = 0.1
 PUSH = np.array([25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-LAG_DEG = float(np.degrees((CAGE_SIDE_M + 25.0 / 5000.0) / RADIUS_M))  # the tool is so far ahead of the bar
+LAG_DEG = float(np.degrees((CAGE_SIDE_M + 25.0 / 5000.0) / RADIUS_M))  # the bar lags behind the tool by this angle
 START = RigidTransform.from_components([0.1, 0.0, 0.0], Rotation.identity())
 STRONG = Guard(name="effort", quantity=Quantity.FORCE, limit=60.0)
 
 
 class Turned:
-    """An attempt whose tool is carried to one angle after another; each carry ends by the guard named with it."""
+    """Attempt that moves the tool to a sequence of angles; each motion ends by the guard named with it."""
 
     def __init__(self, ends: list[tuple[float, str | None]]) -> None:
         self.ends = ends

@@ -1,4 +1,4 @@
-"""A guarded move on an arm that moves in jerks: a force that is gone at rest was the hand's own inertia."""
+"""Tests of a guarded move on a jerky arm: a force that is gone at rest was the inertia of the hand."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ GIVE_N_PER_M = 5000.0
 
 
 class JerkyMover(ScriptedMover):
-    """Stops at each of some depths with 5 N; at rest only what presses at the last of them stays.
+    """Mover that stops at given depths with 5 N; at rest the force becomes that of `rest_n`.
 
     Args:
-        stops_m: depths at which the guard trips, one a try; after them the move runs to its end.
+        stops_m: depths at which the guard trips, one per try; after them the move is completed.
         rest_n: force at rest after each stop.
     """
 
@@ -91,7 +91,7 @@ def test_a_first_firm_contact_costs_one_look_at_rest() -> None:
 
 
 def test_a_smooth_arm_believes_its_first_force() -> None:
-    """A light slider that was knocked leaves no force at rest."""
+    """A light slider that was hit leaves no force at rest."""
     mover = JerkyMover([0.004, 0.009], [0.0, 3.0])
     assert feel(mover, resolution_rad=1e-6).way_m == pytest.approx(0.004, abs=1e-4)
     assert mover.asked == ["feel"]

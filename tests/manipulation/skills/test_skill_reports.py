@@ -1,4 +1,4 @@
-"""What a skill says of its motions: whole skills over a mover that answers each motion as it is told to."""
+"""Tests of the reports of complete skills, with a mover that answers each motion as configured."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DOWN = AT_HOME.rotation.apply([0.0, 0.0, 1.0])
 
 
 class NamedMover(ScriptedMover):
-    """Answers a motion by its name; what has no answer of its own is completed."""
+    """Mover that answers motions by their name; other motions are completed."""
 
     def __init__(self, answers: dict[str, MotionReport]) -> None:
         super().__init__(COMPLETED)
@@ -69,12 +69,12 @@ def before_the_bench(answers: dict[str, MotionReport]) -> tuple[SkillContext, Na
 
 
 def press(context: SkillContext, name: str, expected: str | None = None, **looks: Any) -> SkillReport:
-    """Press the button of that name."""
+    """Press the button called `name`."""
     return button(context, context.panel.object(name), expected, **looks)
 
 
 def pressed(free_m: float, travel_m: float, force_n: float, *, tripped: bool = True) -> MotionReport:
-    """A push down: free, then onto a cap that gives way by `travel_m` and pads that give way by the force."""
+    """Return the report of a push: free, then against a cap that yields by `travel_m` and elastic pads."""
     deepest = free_m + travel_m + force_n / PAD_N_PER_M
     depth = np.linspace(0.0, deepest, 400)
     wrench = np.zeros((400, 6))
@@ -89,7 +89,7 @@ def pressed(free_m: float, travel_m: float, force_n: float, *, tripped: bool = T
 
 def test_the_travel_of_a_cap_is_that_of_the_tip_under_force_less_what_the_pads_gave() -> None:
     found = travelled_m(pressed(0.004, 0.003, 20.0), PAD_N_PER_M)
-    assert found == pytest.approx(0.003, abs=4e-4)  # it begins to count at one newton
+    assert found == pytest.approx(0.003, abs=4e-4)  # counted from a force of one newton
     assert travelled_m(pressed(0.004, 0.0, 0.5), PAD_N_PER_M) == 0.0
 
 
@@ -121,7 +121,7 @@ def test_a_button_whose_lamp_stays_dark_is_not_pressed_again() -> None:
 def test_a_button_whose_lamp_is_as_wanted_is_left_alone_unless_the_look_says_otherwise(
     looks: tuple[str, ...], presses: int, tries: int
 ) -> None:
-    """A press would undo it: asked for `on`, a lamp that was lit went out."""
+    """Another press would undo it: with the goal `on`, a lamp that was lit would go out."""
     context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
     shown = iter(looks)
     lit = ObjectState(name="run_lamp", state="on")
@@ -138,10 +138,10 @@ def test_a_button_whose_lamp_is_as_wanted_is_left_alone_unless_the_look_says_oth
 @pytest.mark.parametrize(
     ("before", "looks", "sweeps"),
     [
-        ("on", ["on", "on"], 0),  # it is there: only looked at
-        ("on", ["off", "on"], 1),  # it was said to be, and is not
-        ("on", [None, "on"], 1),  # nobody can tell: a throw does no harm
-        ("on", ["on", "off", "on"], 1),  # the looks disagree
+        ("on", ["on", "on"], 0),  # already in the goal state: only read
+        ("on", ["off", "on"], 1),  # it was reported to be in the goal state, but is not
+        ("on", [None, "on"], 1),  # unknown: switching does no harm
+        ("on", ["on", "off", "on"], 1),  # the readings disagree
         ("off", ["on"], 1),
         (None, ["on"], 1),
     ],
@@ -187,7 +187,7 @@ def test_a_look_that_cannot_tell_is_not_called_no_look() -> None:
 
 
 def test_a_press_that_may_have_counted_is_not_repeated_when_nobody_can_tell() -> None:
-    """A latching cap that gave way by little was pressed twice, which may have undone it."""
+    """Otherwise a latching cap that yields little is pressed twice, which may undo the press."""
     context, mover = before_the_bench({"press": pressed(0.004, 0.0003, 20.0)})
     told = press(context, "hold", "pressed", verify=lambda: None)
     assert (told.outcome, mover.asked.count("press")) == (Outcome.STALLED, 1)
@@ -198,7 +198,7 @@ def test_a_press_that_may_have_counted_is_not_repeated_when_nobody_can_tell() ->
     ("width_m", "wanted_m", "moves"), [(0.0, 0.0, 0), (0.002, 0.0, 1), (0.0, 0.002, 1), (0.03, 0.03, 1)]
 )
 def test_closed_pads_that_shall_be_closed_are_left_alone(width_m: float, wanted_m: float, moves: int) -> None:
-    """Open ones are sent even where they are: they may press on something there."""
+    """Open pads are commanded even to their present width, because they may press against something there."""
     context, mover = before_the_bench({})
     state = replace(mover.state(), gripper_width_m=width_m)
     mover.state = lambda: state  # type: ignore[method-assign]  # one state for this test
@@ -246,7 +246,7 @@ def test_a_wheel_that_slipped_is_held_more_firmly_up_to_what_a_hand_may() -> Non
 
 
 def _turned(name: str, target: str, now: ObjectState, seen: ObjectState) -> Outcome:
-    """The hand finds nothing between its fingers, so that the look alone decides."""
+    """The hand finds nothing between its fingers, so only the reading decides."""
     context, _ = before_the_bench({})
     return operate(context, context.panel.object(name), target, current=now, verify=lambda: seen).outcome
 

@@ -1,4 +1,4 @@
-"""Stations for calibrating: the target is in view, what is chosen first tells most, gravity comes from all sides."""
+"""Calibration poses have the target in view, the most informative come first, and gravity has varied directions."""
 
 from __future__ import annotations
 

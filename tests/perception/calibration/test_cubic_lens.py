@@ -1,4 +1,4 @@
-"""The paper's cubic correction by hand-computed monomials."""
+"""Compares the paper's cubic correction with monomials computed by hand."""
 
 from __future__ import annotations
 

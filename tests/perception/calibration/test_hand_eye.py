@@ -1,4 +1,4 @@
-"""Hand-eye and robot-world: simulated stations, statistics of the covariance, degenerate sets, the next pose."""
+"""Tests of hand-eye and robot-world calibration: simulated poses, covariance statistics, degenerate sets, next pose."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perception.calibration.hand_eye import HandEyeView, calibrate_hand_eye, pro
 X_TRUE = transform_rpy([0.03, -0.05, 0.08], [0.02, -0.03, np.pi / 2])
 Z_TRUE = transform_rpy([0.7, 0.1, 0.4], [0.0, -np.pi / 2, 0.3])
 ARM = np.diag([1e-4**2] * 6)
-# Lights 560 x 400 mm at 0.6 m, f = 800 px, 0.15 px: what `vision.quadrangle` states, rounded up.
+# Covariance that `vision.quadrangle` states for lights 560 x 400 mm apart at 0.6 m, f = 800 px, 0.15 px, rounded up.
 SEEN = np.diag([2e-4**2, 2e-4**2, 5e-4**2, 8e-4**2, 8e-4**2, 3e-4**2])
 
 
@@ -91,7 +91,7 @@ def test_degenerate_stations_are_refused_and_the_next_turn_is_named(kind: str) -
     with pytest.raises(NotObservable, match="one axis") as refused:
         calibrate_hand_eye(station_views(flanges, 1))
     axis = np.array(refused.value.details["next_axis"])
-    assert abs(axis[2]) < 0.1  # not again about z
+    assert abs(axis[2]) < 0.1  # a rotation about another axis than z
     turned = [transform(Rotation.from_rotvec(angle * axis).as_matrix(), np.zeros(3)) for angle in (-0.5, 0.5)]
     repaired = flanges + [first * turn for turn in turned]
     if kind == "one axis":

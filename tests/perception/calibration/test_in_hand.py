@@ -1,4 +1,4 @@
-"""Camera on the hand: derivatives, statistics of the covariance, a wrong view, degenerate sets."""
+"""Tests of a camera on the hand: derivatives, covariance statistics, a wrong view, degenerate sets."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def poses(count: int = 12) -> list[RigidTransform]:
 
 
 def drawn(seed: int, flanges: list[RigidTransform], known: Beforehand = KNOWN) -> list[InHandView]:
-    """Views with every error drawn as stated."""
+    """Return views with every error drawn as stated."""
     rng = np.random.default_rng(seed)
     z = rng.standard_normal(3)
     lens = replace(LENS, fx_px=LENS.fx_px * (1 + known.focal_ratio * z[0]), fy_px=LENS.fy_px * (1 + known.focal_ratio * z[1]),
@@ -74,7 +74,7 @@ def solved(seed: int, **more: float) -> InHandCalibration:
 def test_the_derivatives_are_those_of_finite_differences(disc_m: float) -> None:
     view, state, step = drawn(1, poses(4))[2], start(), 1e-6
     _, jacobian = _residual(view, POINTS, state, disc_m)
-    # A disc's offset, hundredths of a pixel, is held while camera and target move: checked for its own columns.
+    # The offset of a disc, 0.01 px, is kept constant while camera and target move, so only its own columns are checked.
     for k in range(0 if disc_m == 0.0 else jacobian.shape[1] - 2, jacobian.shape[1]):
         bump = np.zeros(jacobian.shape[1])
         bump[k] = step

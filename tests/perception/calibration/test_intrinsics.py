@@ -1,4 +1,4 @@
-"""Intrinsics from boards and lights: simulated views, drawn boards, OpenCV as an oracle, and what is not observable."""
+"""Tests of intrinsics from boards and lights: simulated views, drawn boards, OpenCV as reference, observability."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_cubic_correction_reports_its_bias() -> None:
     miss = result.cubic.ideal(grid) - undistort_pixels(grid, TRUE)
     rms = float(np.sqrt(np.mean(np.sum(miss**2, axis=1))))
     assert rms < 3.0 * result.cubic.bias_px + 0.1
-    assert 0.01 < result.cubic.bias_px < 2.0  # more data would not take it away
+    assert 0.01 < result.cubic.bias_px < 2.0  # more data would not remove it
     assert result.cubic_covariance.shape == (10, 10)
 
 
@@ -113,7 +113,7 @@ def test_bad_input_is_refused(change: str) -> None:
 
 
 def drawn(texture: np.ndarray, size_m: tuple[float, float], seed: int) -> np.ndarray:
-    """The flat texture seen by the straight camera, tilted at random, on a light wall."""
+    """Return an image of the flat texture, tilted at random, on a bright wall."""
     rng = np.random.default_rng(seed)
     R = Rotation.from_euler("xyz", rng.uniform(-1, 1, 3) * [30, 30, 15], degrees=True)
     t = np.array([rng.uniform(-0.03, 0.03), rng.uniform(-0.03, 0.03), rng.uniform(0.45, 0.6)])
@@ -135,7 +135,7 @@ def test_a_drawn_charuco_board_calibrates_the_camera() -> None:
     for seed in range(10):
         blurred = cv2.GaussianBlur(drawn(texture, size, seed), (0, 0), 0.7).astype(float)
         found.append(board.find(np.clip(blurred + noise.normal(0.0, 3.0, blurred.shape), 0, 255).astype(np.uint8)))
-    assert np.mean([len(view.points_m) for view in found]) > 35  # of 40: markers of 25 pixels
+    assert np.mean([len(view.points_m) for view in found]) > 35  # of 40, with markers of 25 pixels
     result = calibrate_camera(found, (640, 480))
     assert result.rms_px < 0.12
     assert result.chi_square < 1.5 * result.degrees

@@ -1,4 +1,4 @@
-"""Records of calibrations: written, read back, counted up."""
+"""Calibration records are written, read back, and get increasing versions."""
 
 from __future__ import annotations
 

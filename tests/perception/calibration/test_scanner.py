@@ -1,4 +1,4 @@
-"""Range scanner to hand: simulated sweeps of one plate, as a line scanner and as a range camera."""
+"""Tests of calibrating a range scanner on the hand by simulated scans of a plate, with lines and with images."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_what_stands_on_the_plate_does_not_pull() -> None:
     dirty = []
     for view in clean:
         points = view.points_m.copy()
-        points[::12] *= 0.95  # 20 mm nearer: a meter on the plate
+        points[::12] *= 0.95  # 20 mm nearer, like a meter on the plate
         dirty.append(ScannerView(base_from_flange=view.base_from_flange, points_m=points, sigma_m=view.sigma_m))
     results = [calibrate_scanner(made, Y_TRUE, plate) for made in (clean, dirty)]
     poses = [result.flange_from_scanner.parent_from_child for result in results]

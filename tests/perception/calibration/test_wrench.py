@@ -1,4 +1,4 @@
-"""Tool weight and sensor bias: exact and noisy readings, and poses that cannot tell them apart."""
+"""Tests of tool weight and sensor bias: exact and noisy readings, and poses that cannot separate them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small synthetic range images with known truth, made here so that no test needs outside data."""
+"""Small synthetic range images with known truth, so that no test needs external data."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ PARALLEL = OrthographicSensor(width_px=160, height_px=120, pixel_pitch_m=0.0015)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Picture:
-    """Depth (H, W) in metres, and the truth labels (H, W)."""
+    """Depth (H, W) in metres, and the true labels (H, W)."""
 
     depth_m: Array
     labels: NDArray[np.int64]
 
 
 def rays(sensor: PinholeSensor | OrthographicSensor) -> tuple[Array, Array]:
-    """Origins and directions (H, W, 3), written apart from the code under test."""
+    """Return origins and directions (H, W, 3), implemented independently of the code under test."""
     v, u = np.mgrid[: sensor.height_px, : sensor.width_px].astype(float)
     one = np.ones_like(u)
     if isinstance(sensor, PinholeSensor):
@@ -35,19 +35,19 @@ def rays(sensor: PinholeSensor | OrthographicSensor) -> tuple[Array, Array]:
 
 
 def plane_depth(sensor: PinholeSensor | OrthographicSensor, normal: Array, point: Array) -> Array:
-    """Depth of the plane through `point` at each pixel."""
+    """Return the depth of the plane through `point` at each pixel."""
     origin, direction = rays(sensor)
     return np.asarray(((point - origin) @ normal) / (direction @ normal))
 
 
 def sphere_depth(sensor: PinholeSensor | OrthographicSensor, centre: Array, radius: float) -> Array:
-    """Nearer depth of a sphere; infinite where the ray misses."""
+    """Return the nearer depth of a sphere; infinite where the ray misses it."""
     origin, direction = rays(sensor)
     return _near_root(direction, origin - centre, np.eye(3), radius**2)
 
 
 def cylinder_depth(sensor: PinholeSensor | OrthographicSensor, point: Array, axis: Array, radius: float) -> Array:
-    """Nearer depth of an endless cylinder; infinite where the ray misses."""
+    """Return the nearer depth of an infinite cylinder; infinite where the ray misses it."""
     origin, direction = rays(sensor)
     a = np.asarray(axis) / np.linalg.norm(axis)
     return _near_root(direction, origin - point, np.eye(3) - np.outer(a, a), radius**2)
@@ -63,13 +63,13 @@ def _near_root(D: Array, W: Array, M: Array, level: float) -> Array:
 
 
 def nearest(*depths: Array) -> Picture:
-    """What the sensor sees of several surfaces, labels from 1 in the order given."""
+    """Return the sensor's view of several surfaces, with labels from 1 in the given order."""
     stack = np.stack(depths)
     return Picture(depth_m=stack.min(axis=0), labels=stack.argmin(axis=0) + 1)
 
 
 def noisy(depth_m: Array, sigma_m: float, seed: int, gross: float = 0.0) -> Array:
-    """White noise, and a share of gross errors at the image's nearest and farthest depth."""
+    """Add white noise, and a fraction of gross errors at the nearest and the farthest depth of the image."""
     rng = np.random.default_rng(seed)
     out = depth_m + rng.normal(0.0, sigma_m, depth_m.shape)
     hit = rng.random(depth_m.shape)
@@ -79,7 +79,7 @@ def noisy(depth_m: Array, sigma_m: float, seed: int, gross: float = 0.0) -> Arra
 
 
 def ball_on_table(sensor: PinholeSensor | OrthographicSensor = PINHOLE) -> Picture:
-    """A tilted table, a ball of 40 mm and a pipe of 25 mm radius."""
+    """Return a tilted table with a ball of 40 mm radius and a pipe of 25 mm radius."""
     table = plane_depth(sensor, np.array([0.0, -0.5, -0.85]), np.array([0.0, 0.0, 0.62]))
     ball = sphere_depth(sensor, np.array([-0.07, 0.0, 0.58]), 0.04)
     pipe = cylinder_depth(sensor, np.array([0.08, 0.0, 0.56]), np.array([0.15, 1.0, -0.6]), 0.025)

@@ -1,4 +1,4 @@
-"""The whole chain: images of known surfaces, bad input, and the same answer every time."""
+"""Tests of the whole chain: images of known surfaces, bad input, and reproducible results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.perception.range.scenes import PARALLEL, PINHOLE, ball_on_table, nois
 def test_table_ball_and_pipe_are_found_and_named(sensor, sigma_m):
     truth = ball_on_table(sensor)
     scene = analyse(noisy(truth.depth_m, sigma_m, seed=1, gross=0.01), sensor)
-    # Crumbs of the steep rims may stay apart; nothing of size may.
+    # Small remains of the steep rims may be separate regions, but nothing large.
     large = [s for s in scene.surfaces if s.pixels > 100]
     assert sorted(s.type for s in large) == [SurfaceType.CYLINDER, SurfaceType.PLANE, SurfaceType.SPHERE]
     ball = scene.of_type(SurfaceType.SPHERE)[0].primitive

@@ -1,4 +1,4 @@
-"""Recordings, batches, pictures, images of points and features."""
+"""Tests of recordings, batches, rendered pictures, and images from points and features."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_the_batch_is_the_same_for_one_and_two_workers(folder):
 
 
 def _shut_out(worker_pids, seen):
-    """A progress callback that kills one worker process as soon as a task is done."""
+    """Progress callback that kills one worker process as soon as a task is done."""
 
     def progress(done, total):
         if not seen:
@@ -191,7 +191,7 @@ def test_json_picture_and_point_cloud(tmp_path):
 
 
 def test_the_points_of_a_sweep_become_a_plane_in_the_base_frame():
-    """A scanner on the wrist slides along y and looks down on a slab; every scan has its own arm pose."""
+    """A scanner on the wrist moves along y and looks down on a slab; every scan has its own arm pose."""
     rng = np.random.default_rng(0)
     angles = np.linspace(-0.4, 0.4, 181)
     down = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]))

@@ -1,4 +1,4 @@
-"""What a batch has done is on disk as it comes, and a second run takes over exactly what still holds."""
+"""A batch writes each result at once, and a second run reuses exactly the results that are still valid."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def kept_in(folder: Path, reading: Reading = AS_FILED, *, afresh: bool = False) 
 
 
 def stopped_batch(folder: Path) -> KeptResults:
-    """A batch that was stopped after its second task."""
+    """Return a batch that was stopped after its second task."""
     kept = kept_in(folder)
     assert kept.of(folder.iterdir()) == {} and not kept.goes_on
     kept.add(GOOD[:2])
@@ -65,7 +65,7 @@ def test_a_line_that_an_abrupt_end_has_cut_costs_only_itself(folder: Path) -> No
 
 
 def test_what_is_told_as_done_is_what_is_written(folder: Path) -> None:
-    """Ctrl-C may come between a write and a count of it, as it did in a test of the whole command once."""
+    """Ctrl-C may come between a write and its count."""
     kept = stopped_batch(folder)
     lines = kept.part.read_text().splitlines(keepends=True)
     kept.part.write_text("".join(lines[:-1]))

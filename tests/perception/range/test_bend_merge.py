@@ -1,4 +1,4 @@
-"""Slow errors of a sensor bend a flat face and break it into pieces: both are undone, and creases and steps stay."""
+"""Correlated sensor errors bend a flat face and split it; both are corrected, and creases and steps are kept."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def rays(mask):
 
 
 def sampled(kind, th, mask, noise, *, seed=0, sigma=1.0):
-    """The (4, N) samples of the pixels in `mask`, with white noise of `sigma` times the model's."""
+    """Return the (4, N) samples of the pixels in `mask`, with white noise of `sigma` times the model's."""
     x, y = rays(mask)
     z = np.empty(x.size)
     depths_on(kind, th, x, y, True, z)
@@ -53,7 +53,7 @@ def box(top, bottom, left, right):
 
 
 WALL = box(20, 100, 30, 130)
-BENT_WALL = surface(SPHERE, 0.0, 0.0, 14.0, 12.0, 1.0)  # 12 m radius, 2 m away: turns by 0.1 rad over the wall
+BENT_WALL = surface(SPHERE, 0.0, 0.0, 14.0, 12.0, 1.0)  # 12 m radius, 2 m away: its normal turns by 0.1 rad
 BALL = surface(SPHERE, 0.0, 0.0, 2.3, 0.3, 1.0)
 
 
@@ -112,7 +112,7 @@ LEFT, RIGHT = box(20, 100, 20, 80), box(20, 100, 80, 140)
 
 
 def image_of(parts, noise, background_m=np.nan):
-    """The regions of an image of `parts`, each a surface and its mask, the later before the earlier."""
+    """Return the regions of an image of `parts`, each a surface and its mask; later parts hide earlier ones."""
     depth, labels = np.full(SHAPE, background_m), np.zeros(SHAPE, np.int32)
     for k, (shape, mask) in enumerate(parts, 1):
         depth[mask], labels[mask] = sampled(*shape, mask, noise, seed=k)[2], k
@@ -120,7 +120,7 @@ def image_of(parts, noise, background_m=np.nan):
 
 
 def merged(left, right, noise):
-    """The owners of labels 1 and 2, two planes that touch along a column."""
+    """Return the owners of labels 1 and 2, two planes that touch along a column."""
     regions = image_of([(left, LEFT), (right, RIGHT)], noise)
     return merge_touching(regions, [left[0], right[0]], [left[1], right[1]])
 
@@ -139,14 +139,14 @@ FINE = NoiseModel(white=(0.0004, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))
 
 @pytest.mark.parametrize(("turn_rad", "is_one"), [(0.05, True), (0.15, False)])
 def test_facets_of_upholstery_are_one_face_and_faces_of_a_blunt_body_are_not(turn_rad, is_one):
-    # Halves 1 m wide leave their common plane by up to 0.25 m * turn; 2 % of their size are 23 mm.
+    # Halves 1 m wide deviate from their common plane by up to 0.25 m * turn; 2 % of their size is 23 mm.
     left = plane([np.sin(turn_rad), 0.0, -np.cos(turn_rad)], -2.0 * np.cos(turn_rad))
     assert (len(set(merged(left, plane([0.0, 0.0, -1.0], -2.0), FINE))) == 1) == is_one
 
 
 @pytest.mark.parametrize(("width_px", "is_one"), [(3, True), (9, False)])
 def test_a_rounded_edge_belongs_to_its_face_and_a_chamfer_does_not(width_px, is_one):
-    strip = plane([np.sin(0.4), 0.0, -np.cos(0.4)], -2.0 * np.cos(0.4))  # turns where the wall ends, at x = 0
+    strip = plane([np.sin(0.4), 0.0, -np.cos(0.4)], -2.0 * np.cos(0.4))  # meets the wall's end, at x = 0, at an angle
     regions = image_of([(WALL_2M, LEFT), (strip, box(20, 100, 80, 80 + width_px))], FINE)
     owners = merge_touching(regions, [PLANE, PLANE], [WALL_2M[1], strip[1]])
     assert (len(set(owners)) == 1) == is_one
@@ -159,7 +159,7 @@ def test_a_step_between_parallel_faces_stays():
 def test_pieces_of_a_bent_table_are_joined_behind_what_parts_them():
     left, right = plane([0.008, 0.3, -1.0], -2.0), plane([-0.008, 0.3, -1.0], -2.0)
     apart = [(left, box(20, 100, 10, 60)), (right, box(20, 100, 90, 150))]
-    regions = image_of(apart, SLOW, background_m=1.5)  # something nearer between them
+    regions = image_of(apart, SLOW, background_m=1.5)  # a nearer surface is between them
     owners = join_pieces(regions, [PLANE, PLANE], [left[1], right[1]])
     assert len(set(owners)) == 1
 
@@ -183,7 +183,7 @@ SPOT = box(55, 65, 75, 85)
 
 
 def spot_gain(offset_m, noise):
-    """The gain of joining a spot, turned by 0.4 rad and shifted by an offset, with the wall around it."""
+    """Return the gain of joining a spot, tilted by 0.4 rad and shifted by an offset, with the wall around it."""
     spot = plane([0.4, 0.0, -1.0], -(2.0 + offset_m) / np.hypot(0.4, 1.0))
     samples = sampled(*plane([0, 0, -1], -(2.0 + offset_m)), SPOT, noise)
     return scrap_gain(*WALL_2M, *spot, samples, float(SPOT.sum()), noise.packed(), True)

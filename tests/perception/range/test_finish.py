@@ -1,4 +1,4 @@
-"""The last refinement stays with the surface that it began with."""
+"""The final refinement stays near the surface that it begins with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blocks, their tangent planes and the order of seeds: compiled loops against their definitions in numpy."""
+"""Compares the compiled loops for blocks, tangent planes and the order of seeds with their definitions in numpy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from perception.range.segmentation.tangents import JUMP_SIGMAS
 from perception.range.sensor import OrthographicSensor, PinholeSensor
 
 NOISE = NoiseModel(white=(0.0004, 0.0002), correlated=(0.0, 0.0001), step=(0.0008, 0.0))
-SHAPE = (46, 301)  # no multiple of a block or of a run of them
+SHAPE = (46, 301)  # not a multiple of a block or of a run of blocks
 SENSORS = [
     PinholeSensor(width_px=SHAPE[1], height_px=SHAPE[0], fx_px=300.0, fy_px=310.0, cx_px=150.0, cy_px=22.0),
     OrthographicSensor(width_px=SHAPE[1], height_px=SHAPE[0], pixel_pitch_m=0.002),
@@ -70,7 +70,7 @@ def test_a_block_is_the_mean_of_what_lies_near_its_median(sensor, size):
             continue
         of = depth[v, u][near]
         mean = 1.0 / np.mean(1.0 / of) if grid.perspective else of.mean()
-        np.testing.assert_allclose(grid.z[r, c], mean, atol=1e-7)  # the series for 1 / z ends at the third power
+        np.testing.assert_allclose(grid.z[r, c], mean, atol=1e-7)  # the series for 1 / z is cut after the third power
 
 
 @grids()
@@ -91,7 +91,7 @@ def test_a_tangent_plane_is_the_least_squares_plane_of_the_blocks_around(sensor,
             continue
         x, y, z = grid.x[i, j][near], grid.y[i, j][near], grid.z[i, j][near]
         A = np.stack([x, y, np.ones_like(x)], axis=1)
-        if size == 1:  # larger blocks weigh as many as they hold, which the grid does not tell
+        if size == 1:  # the weight of a larger block is its number of pixels, which the grid does not contain
             a, b, g0 = np.linalg.lstsq(A, 1.0 / z if grid.perspective else z, rcond=None)[0]
             normal = np.array([a, b, g0] if grid.perspective else [-a, -b, 1.0])
             towards = -np.sign(normal @ ([grid.x[r, c], grid.y[r, c], 1.0] if grid.perspective else [0.0, 0.0, 1.0]))
@@ -120,7 +120,7 @@ def test_seeds_come_flattest_first_and_in_raster_order_where_equally_flat():
 
 
 def test_a_span_fill_finds_the_blocks_that_growth_by_neighbours_finds():
-    """With the plane held, both ways of growing are the component of explained blocks around the seed."""
+    """With a fixed plane, both ways of growing give the component of explained blocks around the seed."""
     grid = build_grid(depth_with_a_jump_and_holes(), SENSORS[1], NOISE, 1)
     h, w = grid.z.shape
     free = np.isfinite(grid.z)

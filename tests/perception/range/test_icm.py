@@ -1,4 +1,4 @@
-"""Pixels between equally good surfaces follow their neighbours: the compiled sweep against its definition."""
+"""Pixels between equally good surfaces follow their neighbours; compares the compiled sweep with its definition."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SLOW_SHARE = 0.4
 
 
 def swept(sensor, depth, labels, rows, columns, cuts=(0.0, 0.4, 1.0)):
-    """Labels after one compiled sweep over those pixels, their list cut into parts; and which pixels moved."""
+    """Return the labels after one compiled sweep over the pixels, in several parts, and the pixels that changed."""
     names, after = np.full_like(rows, -1), labels.copy()
     ends = (np.array(cuts) * rows.size).astype(int).tolist()
     judge = partial(icm.icm_sweep, depth, sensor.packed(), NOISE.packed(), SLOW_SHARE, labels, KINDS)
@@ -27,7 +27,7 @@ def swept(sensor, depth, labels, rows, columns, cuts=(0.0, 0.4, 1.0)):
 
 
 def settled_label(sensor, depth, labels, v, u):
-    """One pixel by the definition: half a squared residual competes with the share of other labels around."""
+    """Return the label of one pixel by definition: half the squared residual plus a penalty for other labels around."""
     packed, z, table, reach = sensor.packed(), depth[v, u], competing_surfaces(), icm.REACH_PX
     top, left = max(v - reach, 0), max(u - reach, 0)
     patch = labels[top : v + reach + 1, left : u + reach + 1].copy()

@@ -1,4 +1,4 @@
-"""The model file, and components found by their surfaces."""
+"""Tests of the model file, and of components found by their surfaces."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MIDDLE = np.array([0.0, 0.0, 0.6])
 
 
 def place(x_m: float, y_m: float, height_m: float) -> np.ndarray:
-    """Point of the panel frame: x the sensor's x laid into the plane, z outward."""
+    """Return a point of the panel frame: x is the sensor's x projected into the plane, z points outward."""
     x = np.array([1.0, 0, 0]) - NORMAL[0] * NORMAL
     x /= np.linalg.norm(x)
     return MIDDLE + x * x_m + np.cross(NORMAL, x) * y_m + NORMAL * height_m
@@ -35,7 +35,7 @@ def disc_depth(centre: np.ndarray, radius: float) -> np.ndarray:
 
 
 def panel_image(seed: int, pressed_m: float = 0.0, hidden: bool = False) -> np.ndarray:
-    """An emergency knob, a push button and a lamp on a panel."""
+    """Return a depth image of an emergency knob, a push button and a lamp on a panel."""
     parts = [
         plane_depth(SENSOR, NORMAL, MIDDLE),
         sphere_depth(SENSOR, place(-0.06, 0.0, 0.010 - pressed_m), 0.030),
@@ -44,7 +44,7 @@ def panel_image(seed: int, pressed_m: float = 0.0, hidden: bool = False) -> np.n
     ]
     depth = np.min(parts, axis=0)
     if hidden:
-        depth[:, 60:82] = 0.4  # a bar hides a good third of the knob
+        depth[:, 60:82] = 0.4  # a bar hides more than a third of the knob
     return depth + np.random.default_rng(seed).normal(0, 0.0004, depth.shape)
 
 
@@ -113,7 +113,7 @@ def test_caps_of_two_buttons_at_one_height_are_one_surface_and_two_buttons():
     plate = plane_depth(SENSOR, NORMAL, MIDDLE)
     caps = [disc_depth(place(x, 0.01, 0.010), 0.013) for x in (-0.03, 0.03)]
     depth = np.min([plate, *caps], axis=0) + np.random.default_rng(7).normal(0, 0.0004, plate.shape)
-    depth[:, 102:138] = 0.4  # a bar from the one to the other
+    depth[:, 102:138] = 0.4  # a bar from one to the other
     scene = analyse(depth, SENSOR)
     assert len(scene.surfaces) == 3
     buttons = [m for m in load_models(LIBRARY) if m.name == "push_button"]

@@ -1,4 +1,4 @@
-"""The noise of an image is measured in its white, slow and stepped parts."""
+"""The white, correlated and quantisation parts of an image's noise are measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The mission's step: scan the panel and fit its plane near where it should be."""
+"""Tests of the mission's step that scans the panel and fits its plane near the expected place."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def panel_with_a_lamp(seed: int) -> np.ndarray:
     panel = plane_depth(PINHOLE, NORMAL, POINT)
     lamp = sphere_depth(PINHOLE, np.array([0.03, 0.02, 0.6]), 0.03)
     depth = noisy(nearest(panel, lamp).depth_m, 0.0008, seed, gross=0.02)
-    depth[:, 130:] += 0.09  # a wall behind the panel's edge, parallel to it
+    depth[:, 130:] += 0.09  # a wall beyond the panel's edge, parallel to it
     return depth
 
 
@@ -36,7 +36,7 @@ def test_the_panel_is_found_from_a_rough_expectation():
 
 
 def test_errors_match_the_covariance():
-    """Over many scans the mean squared error in sigmas is near one, for the offset and for both tilts."""
+    """Over many scans the mean squared error in units of sigma is near one, for the offset and for both tilts."""
     squares = []
     for seed in range(60):
         fit = fit_plane_near(panel_with_a_lamp(seed), PINHOLE, point_m=POINT, normal=NORMAL)

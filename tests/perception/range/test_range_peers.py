@@ -1,4 +1,4 @@
-"""How the benchmark judges other people's segmenters; the libraries themselves are not installed for tests."""
+"""Tests of how the benchmark judges third-party segmenters, which themselves are not installed for tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hal.arrays import Array
 
 def test_a_surface_in_two_parts_of_the_image_is_two_regions_and_holes_belong_to_none() -> None:
     points = np.zeros((20, 30, 3))
-    points[:, 14:16] = np.nan  # parts the image
+    points[:, 14:16] = np.nan  # divides the image
     points[:, 16:, 2] = 1.0
 
     def everything(_: ModuleType, left: Array) -> Iterator[Found]:

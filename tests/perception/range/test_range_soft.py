@@ -1,4 +1,4 @@
-"""The soft boxes of the range benchmark are what they say: closed, rounded, bulged by what was asked."""
+"""The soft boxes of the range benchmark are closed, rounded, and bulge by the requested amount."""
 
 from __future__ import annotations
 

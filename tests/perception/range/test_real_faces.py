@@ -1,4 +1,4 @@
-"""Faces as real things have them: bulged, with rounded edges, side by side with a groove between."""
+"""Tests with faces of real things: bulging, with rounded edges, side by side with a groove between them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_post_before_a_plane_does_not_part_it():
 
 
 def roof(radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Two planes at right angles that a rounded edge joins, square on: depth, labels, kinds and their parameters."""
+    """Return two planes at a right angle with a rounded edge: depth, labels, kinds and their parameters."""
     pitch = PARALLEL.pixel_pitch_m
     x = np.broadcast_to((np.arange(160) - 79.5) * pitch, (120, 160))
     axis_z = 0.5 + radius_m * np.sqrt(2.0)
@@ -56,7 +56,7 @@ def test_what_is_left_of_a_rounded_edge_that_has_gone_is_no_surface(share, left)
     edge = labels == 3
     off = edge & (np.arange(120) < share * 120)[:, None]
     after = fillets.without_fillets(np.where(off, depth - 0.05, depth), PARALLEL.packed(), LAW, labels, kinds, table)
-    np.testing.assert_array_equal(after[off], left)  # a strip that mostly stays is a net of edges, or a thin face
+    np.testing.assert_array_equal(after[off], left)  # a strip that mostly remains is a net of edges or a thin face
     assert np.isin(after[edge & ~off], (1, 2)).all()
 
 
@@ -67,7 +67,7 @@ def test_what_is_left_of_a_rounded_edge_that_has_gone_is_no_surface(share, left)
         (2.9, 0.7, True, False, False),  # a bevel
         (2.9, 0.7, False, False, True),
         (3.5, 0.4, True, False, False),
-        (3.5, 0.9, True, True, True),  # too narrow for its bend to show
+        (3.5, 0.9, True, True, True),  # too narrow for its bend to be visible
         (4.5, 0.4, True, True, False),
         (2.9, 1.2, True, True, False),
     ],
@@ -93,7 +93,7 @@ def test_what_curves_away_slowly_is_the_faces_as_far_as_the_reach():
     _, labels, kinds, table = roof(0.0)
     labels[:] = np.where(np.arange(160) < 70, 1, 0)
     slope = np.maximum(np.arange(160) - 69, 0) * PARALLEL.pixel_pitch_m
-    off = np.where(np.arange(120) < 60, 0.3, 1.5)[:, None] * slope  # of depth; 0.7 of it across a face at 45 degrees
+    off = np.where(np.arange(120) < 60, 0.3, 1.5)[:, None] * slope  # in depth; at 45 degrees 0.7 of it is normal
     fillets.spread_outwards(plane_of(table[1]) + off, PARALLEL.packed(), LAW, labels, kinds, table, 5)
     inner = slice(3, 57)
     np.testing.assert_array_equal(labels[inner, :75], 1)
@@ -102,7 +102,7 @@ def test_what_curves_away_slowly_is_the_faces_as_far_as_the_reach():
 
 
 def plane_of(th: np.ndarray) -> np.ndarray:
-    """Depth of a plane n . X = d seen by parallel rays."""
+    """Return the depth of a plane n . X = d seen by parallel rays."""
     v, u = np.mgrid[:120, :160]
     x, y = (u - 79.5) * PARALLEL.pixel_pitch_m, (v - 59.5) * PARALLEL.pixel_pitch_m
     return np.asarray((th[3] - th[0] * x - th[1] * y) / th[2])

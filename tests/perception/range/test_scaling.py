@@ -1,4 +1,4 @@
-"""The discrete-event simulation of batches keeps the laws that any schedule keeps."""
+"""The discrete-event simulation of batches obeys the bounds that hold for any schedule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.range_scaling import Cluster, simulate
 @settings(max_examples=50, deadline=None)
 @given(lengths=st.lists(st.floats(0.01, 2.0), min_size=1, max_size=60), workers=st.integers(1, 40))
 def test_a_makespan_lies_between_its_bounds(lengths, workers):
-    """Graham's bounds: at least the mean load and the longest task, at most their sum, hand-overs apart."""
+    """Graham's bounds: at least the mean load and the longest task, at most their sum, apart from hand-overs."""
     work = np.array(lengths)
     makespan = simulate(work, Cluster(workers=workers, handover_s=0.0))
     assert makespan >= max(work.sum() / workers, work.max()) - 1e-9

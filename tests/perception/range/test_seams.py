@@ -1,4 +1,4 @@
-"""Faces in one plane that a groove parts are two, wherever the labels end; things in front and mere touching tell nothing."""
+"""Coplanar faces divided by a groove are two, wherever the labels end; things in front and contact prove nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GROOVE = slice(158, 161)  # columns
 
 
 def wall_with(depth_m: float, slope: float) -> tuple[np.ndarray, np.ndarray]:
-    """A wall 2 m away, its columns at `GROOVE` behind it by `depth_m`, with a millimetre of noise; and its parameters."""
+    """Return a wall 2 m away with a groove of `depth_m` and 1 mm of noise, and the wall's parameters."""
     th = np.zeros(SIZE)
     th[:4] = np.array([slope, 0.0, -1.0, -2.0]) / np.hypot(slope, 1.0)
     x = (np.arange(SHAPE[1]) - PACKED[3]) / PACKED[1]
@@ -30,7 +30,7 @@ def wall_with(depth_m: float, slope: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def halves(seam: int) -> np.ndarray:
-    """Labels 1 and 2 that meet at a column, without the groove's pixels."""
+    """Return labels 1 and 2 that meet at a column, without the pixels of the groove."""
     labels = np.where(np.arange(SHAPE[1]) < seam, 1, 2) * np.ones((SHAPE[0], 1), int)
     labels[:, GROOVE] = 0
     labels[:15] = labels[-15:] = 0
@@ -96,7 +96,7 @@ def test_two_large_faces_that_touch_at_a_corner_are_not_merged():
 def test_a_strip_goes_to_the_face_beside_it_unless_a_groove_parts_them(depth_m, left):
     depth, th = wall_with(depth_m, 0.0)
     labels = halves(159)
-    labels[:, 176:] = 0  # what remains on the right is a strip
+    labels[:, 176:] = 0  # only a strip remains on the right
     kinds, table = np.array([0, PLANE, PLANE]), np.stack([np.zeros(SIZE), th, th])
     after = fillets.without_fillets(depth, PACKED, NOISE.packed(), labels, kinds, table)
     assert set(np.unique(after[20:220, 162:175])) == left

@@ -1,4 +1,4 @@
-"""A wall stays one surface under noise that is slow, and where it bulges by less than that."""
+"""A wall stays one surface under correlated noise, and if it bulges by less than the noise."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ WALL_M = 3.0 / (1.0 + 0.1 * (U - 159.5) / 290.0)
 
 
 def noise_m(sigma_px, seed=4):
-    """12 mm of noise, correlated over `sigma_px` pixels."""
+    """Return 12 mm of noise that is correlated over `sigma_px` pixels."""
     noise = np.random.default_rng(seed).normal(0.0, 1.0, (H, W))
     smooth = cv2.GaussianBlur(noise, (0, 0), sigma_px) if sigma_px else noise
     return 0.012 * smooth / smooth.std()

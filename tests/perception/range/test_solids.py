@@ -1,4 +1,4 @@
-"""Models drawn as rays see them, against a search along the ray, and hypotheses held against such drawings."""
+"""Compares rendered models with a search along each ray, and tests hypotheses by comparison with such renderings."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ FORMS = {
 
 
 def model_of(*surfaces: dict[str, object], **more: object) -> ComponentModel:
-    """One model of the given rows."""
+    """Return a model of the given rows."""
     named = [{"name": f"s{k}", **s} for k, s in enumerate(surfaces)]
     return models_from({"model": {"thing": {"surfaces": named, **more}}})[0]
 
 
 def inside(form: str, X: np.ndarray) -> np.ndarray:
-    """Sign of the surface's equation at points X (N, 3), and NaN outside its bounds; written apart from the code."""
+    """Return the sign of the surface's equation at points X (N, 3), NaN outside its bounds; an independent version."""
     s = model_of(FORMS[form]).surfaces[0]
     W, d = X - s.point_m, s.direction
     h = W @ d
@@ -78,7 +78,7 @@ def test_a_ray_meets_each_form_where_a_search_along_it_does(form, x, y, slant):
     values = inside(form, origin + t[:, None] * direction)
     crossing = np.flatnonzero(values[:-1] * values[1:] <= 0.0)
     if crossing.size == 0:
-        # The search may step over a graze or a rim, the ray may not be off any surface.
+        # The search may miss grazing hits and rims, but the point found by the ray must be on a surface.
         near = values[np.argmin(abs(t - found))] if np.isfinite(found) else 0.0
         assert not np.isfinite(found) or np.isnan(near) or abs(near) < 2e-4 * (50.0 if form == "ellipsoid" else 1.0)
         return
@@ -110,7 +110,7 @@ def test_boxes_hold_what_is_drawn():
 
 
 def panel_view(depth: np.ndarray | None = None) -> View:
-    """The panel 0.5 m away, facing the sensor but for a tilt."""
+    """Return the panel's pose, 0.5 m away, facing the sensor with a tilt."""
     tilt = 0.2
     z = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
     x = np.array([1.0, 0.0, 0.0])
@@ -128,7 +128,7 @@ def panel_view(depth: np.ndarray | None = None) -> View:
 
 
 def drawn(model: ComponentModel, q: np.ndarray, seed: int = 0) -> View:
-    """The view of the model in the pose q before the panel, with noise."""
+    """Return a noisy view of the model with pose q in front of the panel."""
     view = panel_view()
     c, s = np.cos(q[2]), np.sin(q[2])
     R = view.R @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
@@ -144,12 +144,12 @@ def drawn(model: ComponentModel, q: np.ndarray, seed: int = 0) -> View:
 
 
 def named(name: str) -> ComponentModel:
-    """A model of the shipped library."""
+    """Return a model of the shipped library."""
     return next(m for m in shipped_models() if m.name == name)
 
 
 def start(model: ComponentModel, *q: float) -> np.ndarray:
-    """A hypothesis without growth."""
+    """Return a hypothesis without growth."""
     return np.array([*q, *np.zeros(len(model.surfaces))])
 
 
@@ -175,13 +175,13 @@ def test_hidden_pixels_cost_little_and_seen_through_ones_much():
     q, view = start(model, *pose), drawn(model, pose)
     whole = climb(candidate, q, view).score
     half = view.depth_m.copy()
-    half[:, :60] = 0.3  # a board
+    half[:, :60] = 0.3  # a board in front
     behind = panel_view(half)
     hidden = climb(candidate, q, behind)
     assert 0.3 * whole < hidden.score < 0.6 * whole
     counts = explained(candidate.solid, q, behind).counts
     assert counts[FRONT] > 0.4 * counts[COVERED] and counts[BEHIND] < 0.02 * counts[COVERED]
-    half[:, :60] = 0.8  # the sensor sees through it
+    half[:, :60] = 0.8  # the sensor sees beyond the model
     assert climb(candidate, q, panel_view(half)).score < 0.1 * whole
     assert climb(candidate, q, panel_view()).score < 0.0
 
@@ -203,7 +203,7 @@ def test_what_goes_on_beyond_the_outline_contradicts():
 def test_only_sizes_that_may_differ_grow():
     candidate = candidate_of(named("valve_wheel"))
     growths = growths_of(candidate, 4 + len(candidate.solid.rows))
-    assert growths.shape[0] == 1 and growths[0, 4 + 1] > 0  # its rim
+    assert growths.shape[0] == 1 and growths[0, 4 + 1] > 0  # the growth of its rim
 
 
 def test_refining_never_loses():

@@ -1,4 +1,4 @@
-"""A wrong sensor model is named, a right one is not doubted."""
+"""A wrong sensor model is reported, a right one is not."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PARALLEL_SENSOR = OrthographicSensor(width_px=SIDE, height_px=SIDE, pixel_pitch_
 
 
 def tilted(sensor, sigma_m: float = 0.0005) -> np.ndarray:
-    """Two walls that meet in a crease."""
+    """Return two walls that meet in a crease."""
     walls = [plane_depth(sensor, np.array([s * 0.6, 0.2, -1.0]), np.array([0.0, 0.0, 1.0])) for s in (1.0, -1.0)]
     return np.min(walls, axis=0) + np.random.default_rng(0).normal(0.0, sigma_m, (SIDE, SIDE))
 

@@ -1,4 +1,4 @@
-"""A line scanner swept by the wrist: planes come out flat though the wrist moved during each scan."""
+"""A line scanner swept by the wrist measures planes as flat although the wrist moves during each scan."""
 
 from dataclasses import replace
 from typing import Any
@@ -47,7 +47,7 @@ PLANE_Z_M = 1.0
 
 
 def wrist_at(time_s: float) -> RigidTransform:
-    """Moving at 0.3 m/s and nodding at 0.4 rad/s, with the scanner looking along the base's z."""
+    """Return a pose on a motion of 0.3 m/s and 0.4 rad/s, with the scanner looking along the base's z."""
     return RigidTransform.from_components(
         [0.05 * np.sin(time_s), 0.3 * (time_s - 0.5), 0.02 * time_s], Rotation.from_rotvec([0.4 * time_s, 0.1, 0.0])
     )
@@ -59,7 +59,7 @@ def track() -> ScannerTrack:
 
 
 def scan_of_the_plane(end_s: float) -> Stamped[RangeImage]:
-    """Each beam meets z = 1 m of the base from where the scanner was at the beam's own time."""
+    """Return a scan whose beams meet z = 1 m of the base from the scanner's pose at the time of each beam."""
     range_m = []
     for k, t in enumerate(beam_times_s(end_s, LINE)):
         base_from_scanner = wrist_at(float(t)) * WRIST_FROM_SCANNER
@@ -110,7 +110,7 @@ def test_only_lines_are_swept() -> None:
 
 
 def nodding_over_a_plane(seed: int, sigma_m: float) -> dict[str, Any]:
-    """A scanner that nods at 0.4 rad/s before a tilted plane; its scans and poses, as `image_from_sweep` wants them."""
+    """Return scans and poses, for `image_from_sweep`, of a scanner that rotates at 0.4 rad/s before a tilted plane."""
     rng = np.random.default_rng(seed)
     times_s = np.arange(0.0, 2.5, 0.008)
     poses = [RigidTransform.from_rotation(Rotation.from_rotvec([0.4 * (1.25 - t), 0.0, 0.0])) for t in times_s]

@@ -1,4 +1,4 @@
-"""The whole chain tells the same for any number of tiles."""
+"""The whole chain gives the same result for any number of tiles."""
 
 from __future__ import annotations
 

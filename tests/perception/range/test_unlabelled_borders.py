@@ -1,4 +1,4 @@
-"""Where regions touch and what no surface explains, against the plainest way to say it."""
+"""Compares the contacts of regions and the unexplained pixels with the simplest implementation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PACKED = np.array([1.0, 100.0, 120.0, 7.5, 4.0])
 
 
 def patchwork(seed: int, shape: tuple[int, int] = (40, 50), labels: int = 90) -> np.ndarray:
-    """(H, W) labels in patches of a few pixels, a third of them 0."""
+    """Return (H, W) labels in patches of a few pixels, a third of them 0."""
     rng = np.random.default_rng(seed)
     coarse = rng.integers(1, labels + 1, (-(-shape[0] // 3), -(-shape[1] // 3)), dtype=np.int32)
     coarse[rng.random(coarse.shape) < 0.3] = 0
@@ -24,7 +24,7 @@ def patchwork(seed: int, shape: tuple[int, int] = (40, 50), labels: int = 90) ->
 
 
 def plain_contacts(labels: np.ndarray) -> dict[tuple[int, int], list[tuple[float, float]]]:
-    """Places (u, v) of the contacts of each pair, row by row, the left neighbour before the upper one."""
+    """Return the positions (u, v) of the contacts of each pair, row by row, the left neighbour before the upper one."""
     out = defaultdict(list)
     for v, row in enumerate(labels):
         for u, label in enumerate(row):

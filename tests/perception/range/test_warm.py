@@ -1,4 +1,4 @@
-"""Each compiled loop has one set of argument types, and all are compiled before somebody waits for them."""
+"""Each compiled loop has one set of argument types, and all are compiled before a user waits for them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.perception.range.scenes import PARALLEL, PINHOLE, ball_on_table, nois
 
 
 def signatures() -> dict[str, int]:
-    """For how many sets of argument types each compiled loop of the package is loaded, by its name."""
+    """Return for how many sets of argument types each compiled loop of the package is loaded, by name."""
     modules = [module for name, module in sys.modules.items() if name.startswith("perception.range.")]
     loops = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
     return {f"{loop.py_func.__module__}.{loop.py_func.__name__}": len(loop.signatures) for loop in loops}
@@ -22,7 +22,7 @@ def signatures() -> dict[str, int]:
 
 @pytest.fixture(scope="module")
 def warm() -> dict[str, int]:
-    """What is loaded after warming up."""
+    """Return what is loaded after warming up."""
     warm_up()
     return signatures()
 

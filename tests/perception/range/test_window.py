@@ -1,4 +1,4 @@
-"""Windows and codes."""
+"""Tests of windows and codes."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ EDGE_PX = 24.0  # a light nearer to the image's edge may be cut off
 LIGHTS_CONE_RAD = 0.95  # half angle; with 0.6 rad the camera's position along its axis would be 1.5 times as uncertain
 PLATE_CONE_RAD = 0.6
 REACH_STEPS = (0.8, 1.0, 1.2, 1.45, 1.7)  # distances, relative to the shortest one from which everything is in view
-# Of a scan; a plane does not determine shifts in it, nor rotations about its normal.
+# Standard deviations of a pose from a scan; a plane does not determine shifts in it and rotations about its normal.
 PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)
 WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)  # tried angles of the wrist's joints, relative to the parking place
 

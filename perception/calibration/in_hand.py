@@ -27,7 +27,7 @@ from perception.calibration.intrinsics import NAMES, lens_jacobian, parameters, 
 
 FREE = ("fx", "fy", "cx", "cy", "k1")  # lens parameters that are estimated
 INDEX = [NAMES.index(name) for name in FREE]
-LIMIT_M = 0.001  # largest accepted standard deviation of the mount; a drawing is as good as a larger one
+LIMIT_M = 0.001  # largest accepted standard deviation of the mount; one known less well is no better than its drawing
 LIMIT_RAD = 0.0035
 OUTLIER_P = 1e-4  # a view is an outlier if noise gives its residuals with a smaller probability
 FEWEST_VIEWS = 4

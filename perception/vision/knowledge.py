@@ -130,8 +130,9 @@ def _for_image(knowledge: Knowledge, *, noisy: bool) -> Knowledge:
 
 
 def spread_of(kinds: Iterable[TaughtKind]) -> Array:
-    """(LENGTH,) standard deviation of every number over the kinds' looks that count in every image, each kind counting
-    the same.
+    """Return the standard deviation (LENGTH,) of every number over the looks of all kinds but `nothing`.
+
+    Only looks that count in every image are used, and each kind has the same weight.
     """
     lasting = (kind.lasting for kind in kinds if kind.name != NOTHING)
     kinds = [kind for kind in lasting if len(kind.looks)]

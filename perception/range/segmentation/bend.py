@@ -74,7 +74,7 @@ def straightened(kind: int, th: Array, samples: Array, noise: Array, perspective
 
 @compiled
 def schwarz_price(kind: int, patches: float) -> float:
-    """Penalty p ln n for the parameters of a surface in Schwarz's criterion."""
+    """Return the penalty p ln n for the p parameters of a surface in Schwarz's criterion."""
     return float(FREEDOM[kind] * np.log(max(patches, 2.0)))
 
 
@@ -99,7 +99,7 @@ def scrap_gain(
 
 @compiled
 def cut_mean_square(e: Array, limit: float) -> float:
-    """Mean of the squares of e (N,), each capped at the square of `limit`."""
+    """Return the mean of the squares of e (N,), each capped at the square of `limit`."""
     total = 0.0
     for i in range(e.shape[0]):
         cut = min(e[i], limit)

@@ -171,7 +171,7 @@ def _middle_depth(z: Array) -> float:
 
 @compiled
 def sigma_at(noise: Array, z: float) -> float:
-    """Standard deviation of one pixel at depth z, metres; `noise` as `NoiseModel.packed`."""
+    """Return the standard deviation of one pixel at depth z, metres; `noise` as `NoiseModel.packed`."""
     z2 = z * z
     white = noise[0] + noise[1] * z2
     slow = noise[2] + noise[3] * z2
@@ -181,6 +181,9 @@ def sigma_at(noise: Array, z: float) -> float:
 
 @compiled
 def slow_share_at(noise: Array, z: float) -> float:
-    """Part of the variance at depth z that neighbouring pixels share; `noise` as `NoiseModel.packed`."""
+    """Return the share of the variance at depth z that neighbouring pixels have in common.
+
+    `noise` as `NoiseModel.packed`.
+    """
     slow, sigma = noise[2] + noise[3] * z * z, sigma_at(noise, z)
     return float(slow * slow / max(sigma * sigma, 1e-30))

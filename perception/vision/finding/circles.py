@@ -23,7 +23,7 @@ CIRCLES_TRIED = 90  # peaks of the votes that are verified
 LEAST_COVERAGE = 0.45
 HOPELESS_COVERAGE = 0.25  # candidates below it are not refined
 ALIGNED = 0.8  # least cosine between an edge's gradient and the outline's normal
-# Of the search around a peak of the votes, whose cells are larger for large radii.
+# Steps of the search around a peak of the votes, whose cells are larger for large radii.
 STEPS_LARGE_PX = np.array([3.0, 1.5, 0.7])
 STEPS_SMALL_PX = STEPS_LARGE_PX[1:]
 TURNS = np.linspace(0, 2 * np.pi, CIRCLE_SAMPLES, endpoint=False)

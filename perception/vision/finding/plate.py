@@ -39,7 +39,7 @@ FILLED = 0.85
 CONFIRMED = 0.7  # share of a side's visible part that is an edge
 LEAST_CONFIRMED = SIDE_POINTS // 4  # least number of confirmed samples in all; noise and soft shadows give none
 LEAST_SHARE_CONFIRMED = 0.55  # of the visible border; most close-ups and bare walls have less
-# For `is_sure`; the share is reached by all development overviews.
+# Least share, sides and visible samples per side for `is_sure`; all development overviews reach the share.
 SURE_SHARE, SURE_SIDES, SURE_SIDE_VISIBLE = 0.9, 3, 16
 MOST_STRETCHED = 1.45  # see `_stretch`; a plate rotated by a quarter turn has the square of its proportions, 1.8
 

@@ -99,9 +99,8 @@ def gray_of(image: NDArray[Any]) -> Image:
     if min(array.shape[:2]) < 16:
         raise InvalidRequest(f"image is only {array.shape[1]}x{array.shape[0]}", hint="16x16 is the least")
     if array.ndim == 3:
-        return np.asarray(
-            array.mean(axis=2), np.float32
-        )  # not luma, in which a blue lamp would be darker than a green one
+        # The mean and not the luma, in which a blue lamp would be darker than a green one.
+        return np.asarray(array.mean(axis=2), np.float32)
     return array.astype(np.float32)
 
 
@@ -172,9 +171,8 @@ def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, floa
     if np.ptp(x) < 10.0:
         return max(overall, 0.05), 0.0
     i, j = np.triu_indices(len(x), 1)
-    b = max(
-        float(np.median((y[j] - y[i]) / np.maximum(x[j] - x[i], 1.0))), 0.0
-    )  # Theil-Sen, robust to bands with glare
+    # The slope by Theil and Sen is robust to bands with glare.
+    b = max(float(np.median((y[j] - y[i]) / np.maximum(x[j] - x[i], 1.0))), 0.0)
     return max(float(np.median(y - b * x)), 0.05), b
 
 

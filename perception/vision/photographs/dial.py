@@ -30,7 +30,7 @@ COLOUR_OFF_RAD = np.deg2rad(
     14.0
 )  # JPEG stores colours in blocks of 16 px, which may shift a pointer's direction by so much
 SHOWN_WELL = 0.5  # confidence from which the direction in lightness is used
-SURE, CONTRADICTED = 0.8, 0.6  # confidence of a certain needle; and of a drop that contradicts it
+SURE, CONTRADICTED = 0.8, 0.6  # confidence of a certain needle, and of a drop that contradicts it
 RIVALLED = 0.8  # factor on the confidence of an uncertain needle if a drop may point elsewhere
 OTHER_RAD = np.deg2rad(35.0)  # largest angle at which one side of a drop may be taken for a needle
 CLEARER_BY = 0.5  # than the best pointer elsewhere, in units of `_clearness`, for a confidence of one half

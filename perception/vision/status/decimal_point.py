@@ -15,9 +15,9 @@ from perception.vision.status.digit_grid import AXES, DigitGrid
 from perception.vision.status.digit_grid_worth import Float32
 
 RADIUS = 0.075  # of the digit height
-LEVEL = (
-    0.47  # of a lit segment; dots blurred by motion have 0.4 to 0.6, gaps without one up to 0.37 (1400 synthetic ones)
-)
+# Level of a dot over that of a lit segment. Dots blurred by motion have 0.4 to 0.6, gaps without a dot up to 0.37
+# (of 1400 synthetic ones).
+LEVEL = 0.47
 LEVEL_SPREAD = 0.07
 MOST_TYPICAL = 0.37  # if gaps without a point exceed this, the stroke model is wrong
 MOST_ODDS = 6.0  # log odds at most: a brighter dot is not more certain, and two gaps with a dot each stay ambiguous

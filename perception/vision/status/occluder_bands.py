@@ -301,10 +301,8 @@ class _Search:
         """Return place and size of the best bend, and the share of that band; straight unless a bend is better."""
         t, axes = self.t, self.points(shapes)
         knots = np.array([at for at, _ in shapes])[:, None]
-        first, second = (
-            np.minimum(t / knots, 1.0),
-            np.maximum((t - knots) / (1.0 - knots), 0.0),
-        )  # positions along either leg
+        # Positions along either leg.
+        first, second = np.minimum(t / knots, 1.0), np.maximum((t - knots) / (1.0 - knots), 0.0)
         axis = (
             axes[:, :1]
             + first[..., None] * (axes[:, 1] - axes[:, 0])[:, None]

@@ -21,11 +21,11 @@ ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
 WAVES = np.column_stack([np.ones(len(ANGLES)), np.cos(ANGLES), np.sin(ANGLES)])
 FACE, RIM, RING, PLATE = (0.10, 0.62), (0.46, 0.62), (0.86, 1.06), (1.12, 1.32)  # in cap radii
 FACE_RADII = np.linspace(*FACE, 11)
-# Radii at which a gap round the cap is searched; inner part of the face
+# Radii at which a gap around the cap is searched for; inner part of the face
 GAP, INNER = np.linspace(0.5, 1.12, 32), (0.35, 0.50)
 GAP_DARK = 0.85  # share of the gray of face and plate: a gap is darker than both
 LEAST_GAP = 0.6  # share of it that must be visible
-SPOT_TO = 0.46  # in radii: glare from beside the cap is brightest further out
+SPOT_TO = 0.46  # in radii: glare from beside the cap is brightest farther out
 CLEAR_OF_RING = 1.4  # in radii: anything that crosses a circle of this size does not belong to the button
 BLUR_PX = 2.0  # px by which an occluder's blur extends beyond its mask
 LEAST_RING, LEAST_FACE = 0.4, 0.5  # share that must be visible

@@ -11,7 +11,7 @@ from perception.vision.status.digit_grid_worth import Float32
 
 THICK = 0.30  # in digit heights: a stroke with its blur
 NOISE = 0.05  # in digit heights
-ROWS = (-0.12, 0.90)  # in digit heights from the top; decimal points lie further down
+ROWS = (-0.12, 0.90)  # in digit heights from the top; decimal points lie farther down
 BEYOND = 0.35  # in digit heights above and below: where a frame continues
 CLEAR = 0.4  # share of the gap beside the last cell, which holds its own blur and a point
 # Share of the lit level; share of the rows; a sign's least width in digit heights

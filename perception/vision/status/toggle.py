@@ -39,9 +39,8 @@ def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
         status = choose(STATES, _of_one_colour(contrast), noise=noise, seen=seen, what="bat")
         if status.answered and status.state is not None:
             k = STATES.index(status.state)
-            if (
-                contrast[k] < 0.0 < at_foot[1 - k]
-            ):  # a dark bar on this side, and a bright bat in front of its nut on the other
+            # A dark bar on this side, and a bright bat in front of its nut on the other.
+            if contrast[k] < 0.0 < at_foot[1 - k]:
                 return doubted(status, "something lies across the bat: move it or look past it")
             return status
     return choose(STATES, np.abs(at_foot), noise=noise, seen=seen, what="bat")

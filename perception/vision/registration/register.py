@@ -59,13 +59,13 @@ class Registration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObjectFit:
-    """How far an object's own edges lie from where the registered view has them.
+    """Displacement of an object's own edges from their positions in the registered view.
 
     Attributes:
-        shift_px: (2,) the shift, which the built panel's tolerance holds near zero; zero where it was not measured.
-        shift_sigma_px: one sigma of each of its coordinates.
-        edge_share: share of its edges that were found; NaN where too few are in view.
-        measured_px: (2,) the shift by this image alone; None where it was not measured.
+        shift_px: (2,) the displacement, with the building tolerance as prior; zero if it was not measured.
+        shift_sigma_px: standard deviation of each of its coordinates.
+        edge_share: share of its edges that were found; NaN if too few are in view.
+        measured_px: (2,) the displacement according to this image alone; None if it was not measured.
         covariance_px: (2, 2) of `measured_px`.
     """
 
@@ -219,7 +219,7 @@ def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
 def _object_fit(
     smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, built_m: float
 ) -> ObjectFit:
-    """Fit the own shift of an object to its edges.
+    """Fit the displacement of an object to its own edges.
 
     `built_m` is the standard deviation of the object's position on the plate. The edges of an object have a common
     error that does not average out, because a cast shadow or a side wall moves all edges of one side.

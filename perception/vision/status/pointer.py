@@ -183,10 +183,7 @@ def _hidden(
 
 
 def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: float) -> Array:
-    """Return the mean of every column between two quantiles of the visible values.
-
-    0 if half of the column is hidden.
-    """
+    """Return the mean of every column between two quantiles of the visible values; 0 if most of it is hidden."""
     if not hidden.any():
         first, last = _between(np.array(len(columns)), low, high)
         return np.asarray(np.sort(columns, axis=0)[int(first) : int(last)].mean(axis=0), float)

@@ -1,5 +1,5 @@
 # ruff: noqa: E501  (one object a line reads best)
-"""A panel with one object of every kind, and what it shows in the tests."""
+"""Panel with one object of every kind, and the states that it shows in the tests."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ SHOWN: dict[str, Shown] = {
 
 
 def panel() -> Panel:
-    """The test panel."""
+    """Return the test panel."""
     text = TOML.replace('style = "lcd" }', 'style = "lcd", minimum = -99.0 }')
     return parse_toml(text, Panel, source="test")
 
@@ -72,7 +72,7 @@ def scene(
     seed: int = 1,
     size: tuple[int, int] = (1280, 960),
 ) -> tuple[NDArray[np.uint8], CameraIntrinsics, UncertainPose]:
-    """Image, intrinsics and a pose that is wrong by about one sigma of its covariance (a pixel or two)."""
+    """Return image, intrinsics and a pose that is wrong by about one sigma of its covariance (one or two pixels)."""
     intrinsics = camera(*size, focal_px=float(size[0]))
     truth = RigidTransform.from_matrix(
         looking_at(distance_m=distance_m, tilt_rad=np.deg2rad(tilt_deg), azimuth_rad=np.deg2rad(azimuth_deg))

@@ -1,4 +1,4 @@
-"""What is compiled for speed says what numpy and OpenCV say."""
+"""Compares compiled functions with numpy and OpenCV."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def test_polar_values_are_those_of_opencv(seed: int) -> None:
     random = np.random.default_rng(seed)
     image = random.integers(0, 256, (37, 41)).astype(np.uint8)
     centre = random.uniform(5.0, 30.0, 2)
-    radii, angles = np.linspace(0.0, 25.0, 9), np.linspace(-3.0, 3.0, 31)  # some lie outside: the border repeats
+    radii, angles = np.linspace(0.0, 25.0, 9), np.linspace(-3.0, 3.0, 31)  # outside, the border pixels are repeated
     directions = np.stack([np.sin(angles), -np.cos(angles)])
     expected = sample_at(image, *(centre[k] + radii[:, None] * directions[k] for k in (0, 1)))
     values = polar_values(image, (float(centre[0]), float(centre[1])), radii, directions)
-    assert values == pytest.approx(expected, abs=255 / 16)  # OpenCV rounds places to 1/32 px
+    assert values == pytest.approx(expected, abs=255 / 16)  # OpenCV rounds coordinates to 1/32 px
     assert np.mean(np.abs(values - expected)) < 2.0
 
 
@@ -36,7 +36,7 @@ def test_step_counts_are_those_of_second_differences() -> None:
 def reference_axis(
     ink: np.ndarray, r: np.ndarray, offset: np.ndarray, reach: float, e_sigma: float, px: float
 ) -> float:
-    """The angle of `pointer_axis`, in numpy."""
+    """Return the angle of `pointer_axis`, computed by numpy."""
     near = np.broadcast_to(np.abs(offset) < reach, ink.shape)
     solution = np.zeros(2)
     for _ in range(3):
@@ -84,10 +84,10 @@ def test_an_axis_wants_ink_in_three_rows() -> None:
 
 
 def test_rows_where_a_pointer_goes_under_a_cable_do_not_tell_its_axis() -> None:
-    """A cable whose edge runs slantwise over the pointer leaves less and less of it: the rest leans away from the cable."""
+    """A cable that crosses the pointer at an angle leaves less and less of it, so the rest leans away from it."""
     r, offset = np.linspace(0.01, 0.03, 40), np.linspace(-0.3, 0.3, 160)
     ink = (60.0 * np.exp(-0.5 * (offset * r[:, None] / 6e-4) ** 2)).astype(np.float32)
-    hidden = offset * r[:, None] > 2e-3 * (1.0 - np.arange(40)[:, None] / 26)  # meets the pointer half way
+    hidden = offset * r[:, None] > 2e-3 * (1.0 - np.arange(40)[:, None] / 26)  # meets the pointer halfway
     shown = np.where(hidden, 0.0, ink).astype(np.float32)
     seen, _ = pointer_axis(shown, np.zeros(ink.shape, bool), r, offset, 0.12, 3e-4, 2200.0)
     known, _ = pointer_axis(shown, hidden, r, offset, 0.12, 3e-4, 2200.0)

@@ -1,4 +1,4 @@
-"""Bad input is refused by type, before anything is computed."""
+"""Bad input is refused with a typed error before anything is computed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_photograph_is_turned_as_its_camera_was_held() -> None:
     image = np.zeros((40, 60), np.uint8)
     image[:20] = 200
     exif = Pillow.Exif()
-    exif[0x0112] = 6  # the camera was held turned by 90 degrees
+    exif[0x0112] = 6  # the camera was held at 90 degrees
     buffer = io.BytesIO()
     Pillow.fromarray(image).save(buffer, "JPEG", exif=exif)
     turned = decode(buffer.getvalue())

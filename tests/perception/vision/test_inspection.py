@@ -1,4 +1,4 @@
-"""The taught panel end to end: drawn scenes with known truth in, readings out."""
+"""Tests of the taught panel from end to end: readings of drawn scenes with known truth."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_every_kind_is_read_from_every_side(tilt_deg: float, azimuth_deg: float,
     for reading in readings:
         assert reading.present, (reading.name, reading.reason)
         if reading.kind in ("button", "mushroom") and not reading.answered:
-            assert "alike" in (reading.reason or "")  # too coarse to see a 5 mm stroke from the front: it may say so
+            assert "alike" in (reading.reason or "")  # may be refused, as a 5 mm stroke is hard to see from the front
             continue
         check(reading, SHOWN[reading.name])
 
@@ -147,7 +147,7 @@ def test_the_annotated_picture_is_rgb_and_leaves_the_image_alone() -> None:
 
 
 def behind_a_cable(offset_m: float) -> tuple[np.ndarray, CameraIntrinsics, UncertainPose]:
-    """The panel with a dark cable before the display `flow`, so far right of its middle."""
+    """Draw the panel with a dark cable in front of the display `flow`, at a distance to the right of its centre."""
     image, intrinsics, pose = scene(tilt_deg=3.0, distance_m=0.66, pose_error=0.0)
     x, y = panel().object("flow").position_m
     view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
@@ -176,7 +176,7 @@ def test_who_asks_for_more_gets_only_the_surest() -> None:
 
 
 def test_a_jump_is_a_guess_and_no_answer() -> None:
-    look = behind_a_cable(-0.012)  # read at less than .9
+    look = behind_a_cable(-0.012)  # read with a confidence of less than 0.9
     (seen,) = inspect(*look, panel(), names=["flow"])
     far = replace(seen, value=getattr(panel().object("flow"), "maximum", None))
     (refusal,) = inspect(*look, panel(), names=["flow"], previous={"flow": far})

@@ -1,4 +1,4 @@
-"""Kinds survive their files, written by hand or generated; a damaged file is named with what helps."""
+"""Kinds are unchanged after writing and reading their files; the error for a damaged file names it and the remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several looks at one object make one reading, and never a number that one of them excludes."""
+"""Several views of an object are combined into one reading, never into a number that one of them excludes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def shows(text: str, confidence: float) -> ObjectReading:
 
 
 def may_show(**share: float) -> ObjectReading:
-    """A refused display: `_64_1=0.5` stands for the number 64.1."""
+    """Return a refused display reading; `_64_1=0.5` means the number 64.1 with probability 0.5."""
     numbers = tuple(
         Possible(text=(text := name[1:].replace("_", ".")), value=float(text), probability=probability)
         for name, probability in share.items()

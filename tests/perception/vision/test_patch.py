@@ -1,4 +1,4 @@
-"""Rectified patches show what the image shows at the projected place of every point, whatever the lens."""
+"""Rectified patches have the image's value at the projection of every point, whatever the lens."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HALF_M, TOP_M = (0.07, 0.03), 0.016
 
 
 def camera_view(k1: float, *, beside_m: float) -> CameraProjection:
-    """A camera 0.34 m before the plate and `beside_m` to the right of the object."""
+    """Return a camera 0.34 m in front of the plate and `beside_m` to the right of the object."""
     lens = CameraIntrinsics(
         width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5, distortion=(k1, 0, 0, 0, 0)
     )
@@ -27,13 +27,13 @@ def camera_view(k1: float, *, beside_m: float) -> CameraProjection:
 
 
 def ramp(along: int, middle_px: np.ndarray) -> np.ndarray:
-    """Gray tells the column (`along` 0) or the row (1): 128 at the middle, one level a pixel."""
+    """Return an image whose gray encodes the column (`along` 0) or row (1): 128 in the centre, one level per pixel."""
     places = np.indices(SIZE)[1 - along]
     return np.asarray(np.clip(places - np.round(middle_px[along]) + 128, 0, 255), np.uint8)
 
 
 def places_px(view: CameraProjection, *, shift_px: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 2) image places that patches of two ramps say for points all over an object, and those of the view."""
+    """Return (N, 2) image positions of points of an object, by patches of two ramps and by the projection."""
     width_m, height_m = HALF_M
     ways = np.meshgrid(np.linspace(-0.9, 0.9, 7) * width_m, np.linspace(-0.9, 0.9, 5) * height_m)
     x, y = (way.ravel() for way in ways)
@@ -53,7 +53,7 @@ def places_px(view: CameraProjection, *, shift_px: tuple[float, float]) -> tuple
 @pytest.mark.parametrize("beside_m", [-0.12, 0.0, 0.12])
 def test_every_point_of_a_patch_is_taken_from_where_the_lens_puts_it(k1: float, beside_m: float) -> None:
     seen, truly = places_px(camera_view(k1, beside_m=beside_m), shift_px=(0.4, -0.7))
-    assert np.abs(seen - truly).max() < 0.75  # half a gray level of rounding, twice interpolated
+    assert np.abs(seen - truly).max() < 0.75  # rounding by half a gray level, and two interpolations
     assert np.abs((seen - truly).mean(axis=0)).max() < 0.3
 
 

@@ -1,4 +1,4 @@
-"""A refusal keeps its guess; how sure is sure enough is the caller's choice."""
+"""A refusal keeps its best guess, and the caller chooses the confidence that is sufficient."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every compiled loop of vision is compiled once, for one set of argument types, whatever is read."""
+"""Every compiled loop of vision is compiled for one set of argument types, whatever is read."""
 
 from __future__ import annotations
 

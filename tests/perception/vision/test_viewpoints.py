@@ -1,4 +1,4 @@
-"""Viewpoints show what they promise: the point in the middle, the whole plate, every object."""
+"""Viewpoints show the point in the image centre, the whole plate, and every object, as they promise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blind recognition and teaching on drawn scenes."""
+"""Tests of blind recognition and teaching on drawn scenes."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_plate_that_fills_the_image_but_for_one_side_is_found(roll_deg: float)
     turned = cv2.warpAffine(image, turn, (1280, 960), borderMode=cv2.BORDER_REPLICATE)
     corners_px = view.project(corners_m) @ turn[:, :2].T + turn[:, 2]
     low, high = np.round(corners_px.min(axis=0)).astype(int), np.round(corners_px.max(axis=0)).astype(int)
-    first = low - [40, -4]  # the left side shows, the other three are cut off or lie at the very border
+    first = low - [40, -4]  # the left side is visible, the other three are cut off or at the border of the image
     cut = np.ascontiguousarray(turned[first[1] : high[1] - 4, first[0] : high[0] - 4])
     plate = find_plate(cut, *PLATE, focal_px=1280.0)
     assert plate is not None and plate.sides_seen[3]
@@ -321,7 +321,7 @@ def test_the_fast_match_agrees_with_the_plain_one() -> None:
     looks = rng.normal(0, 1, (9, LENGTH))
     for known in (knowledge, knowledge.for_image(noisy=True)):
         assert np.allclose(distances(looks, known), distances_reference(looks, known))
-        for mean_of in (3, 6):  # one kind has four looks only
+        for mean_of in (3, 6):  # one kind has only four looks
             plain = distances_reference(looks, known, mean_of=mean_of)
             assert np.allclose(nearest(looks, prepared(known), mean_of=mean_of), plain)
 
@@ -383,7 +383,7 @@ def test_two_panels_are_ambiguous_blind_too() -> None:
 
 def test_a_border_that_neither_edges_nor_objects_confirm_is_no_plate() -> None:
     bare = np.full((480, 640), 60, np.uint8)
-    bare[100:, 120:] = 170  # one corner of something large
+    bare[100:, 120:] = 170  # a corner of something large
     plate = find_plate(bare, *PLATE)
     assert plate is not None and not plate.is_sure
     with pytest.raises(NotFound, match="not confirmed"):

@@ -1,4 +1,4 @@
-"""Cables before a plate: found as a whole, bridged, and nothing else."""
+"""Cables in front of a plate are found completely and bridged, and nothing else is taken for a cable."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WIDTH_PX = 9
 
 
 def plate(*, seed: int = 3) -> Image:
-    """A plate with a dark meter, a light dial and a long flat track."""
+    """Draw a plate with a dark meter, a bright dial and a long flat track."""
     picture = np.full((450, 600), PLATE_GRAY, np.float32)
     cv2.rectangle(picture, (60, 60), (180, 150), 40.0, -1)
     cv2.circle(picture, (270, 300), 50, 220.0, -1, cv2.LINE_AA)
@@ -29,7 +29,7 @@ def level() -> np.ndarray:
 
 
 def covered() -> np.ndarray:
-    """Where the cable is."""
+    """Return the mask of the cable."""
     mask = np.zeros((450, 600), np.uint8)
     cv2.polylines(mask, [LINE], False, 1, WIDTH_PX)
     return mask > 0
@@ -72,4 +72,4 @@ def test_a_cable_that_leaves_the_plate_at_its_side_is_bridged_as_far_as_it_goes(
     hung = bare.copy()
     hung[mask > 0] = 30
     seen = without_cables(hung, level()).astype(float)
-    assert np.mean(np.abs(seen - bare)[mask > 0] < 25.0) > 0.7  # at the very side only one of its sides shows
+    assert np.mean(np.abs(seen - bare)[mask > 0] < 25.0) > 0.7  # at the border only one side of it is visible

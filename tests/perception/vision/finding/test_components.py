@@ -1,4 +1,4 @@
-"""Connected parts by runs, circles and noise against OpenCV and plain numpy."""
+"""Compares connected components by runs, circles and noise with OpenCV and plain numpy."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_compiled_coverage_is_that_of_plain_numpy() -> None:
     circles[:20] = np.array([120.0, 90.0, 31.0]) + random.normal(0, 1.0, (20, 3))
     maps = (edges.along_x, edges.along_y, edges.strength, edges.strong)
     compiled = np.array([_covered(*maps, NORMALS, *circle) for circle in circles])
-    # A gradient right at the limit of its direction may fall on either side: one sample of the outline.
+    # A gradient exactly at the limit of its direction may be on either side, which is one sample of the outline.
     assert np.abs(compiled - circle_coverage(edges, circles)).max() <= 1.0 / CIRCLE_SAMPLES + 1e-12
     assert compiled.max() > 0.5
 

@@ -1,4 +1,4 @@
-"""Region growing and its sums against plain numpy."""
+"""Compares region growing and its sums with plain numpy."""
 
 from __future__ import annotations
 

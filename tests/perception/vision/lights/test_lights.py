@@ -1,4 +1,4 @@
-"""Lights in an on/off pair: drawn pairs with known truth, stored pairs, and every refusal by name."""
+"""Tests of finding lights in an on/off pair: drawn pairs with known truth, stored pairs, and every refusal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ T_TRUE = np.array([0.01, -0.005, 0.62])
 
 
 def scene(seed: int) -> NDArray[np.float32]:
-    """A textured panel without lights."""
+    """Return a textured panel without lights."""
     rng = np.random.default_rng(seed)
     image = np.full((480, 640), 110.0, np.float32)
     for _ in range(40):
@@ -37,7 +37,7 @@ def scene(seed: int) -> NDArray[np.float32]:
 
 
 def disc(image: NDArray[np.float32], centre_px: Array, radius_px: float, rise: float) -> None:
-    """Add an anti-aliased disc in place."""
+    """Draw an anti-aliased disc in place."""
     v, u = np.mgrid[:480, :640]
     away = np.hypot(u - centre_px[0], v - centre_px[1])
     image += (rise * np.clip(radius_px + 0.5 - away, 0.0, 1.0)).astype(np.float32)
@@ -96,7 +96,7 @@ def test_centres_err_as_their_covariance_says() -> None:
             if np.linalg.norm(e) < 2.0:
                 errors.append(e @ np.linalg.solve(blobs.covariance_px[k], e) / 2.0)
     assert len(errors) > 40
-    assert 0.2 < np.median(errors) / 0.69 < 3.0  # the median of chi-square 2 over 2 is 0.69
+    assert 0.2 < np.median(errors) / 0.69 < 3.0  # the median of chi-square with 2 dof, divided by 2, is 0.69
 
 
 def test_a_missing_light_is_refused_by_its_number() -> None:
@@ -291,7 +291,7 @@ def test_loose_lamps_and_a_bad_lens_make_the_pose_less_certain() -> None:
     )
     for other in (loose, bad):
         assert (np.diag(other.camera_from_panel.covariance) > np.diag(exact.camera_from_panel.covariance)).all()
-    usual_m = 1e-3 * CAMERA.fx_px / 1.0  # nobody said how far away: a metre
+    usual_m = 1e-3 * CAMERA.fx_px / 1.0  # the default distance is one metre
     np.testing.assert_allclose(
         loose.covariance_px - exact.covariance_px, np.tile(usual_m**2 * np.eye(2), (4, 1, 1)), rtol=1e-9, atol=1e-9
     )

@@ -1,4 +1,4 @@
-"""Single dials in many looks: what is read is right, and what glare or size hides is refused."""
+"""Single dials of many designs are read correctly, or refused if glare or their size hides the reading."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.vision_dials import draw_dial, error_of
 from benchmarks.vision_manometers import UNUSUAL, draw_manometer
 from perception.vision.photographs.dial import BY_TICKS, read_dial
 
-TAIL_UNDER_GLARE = 46  # the tip lies under glare, the tail shows
+TAIL_UNDER_GLARE = 46  # the tip is hidden by glare, the tail is visible
 GLARE_BESIDE = (59, 62, 80, 98)
 
 
@@ -51,7 +51,7 @@ def test_a_dial_without_a_pointer_is_refused() -> None:
     assert status.reason
 
 
-@pytest.mark.parametrize("seed", [2088, 2203])  # a glare on a drop's hub; a face that is white itself
+@pytest.mark.parametrize("seed", [2088, 2203])  # glare on the hub of a drop-shaped pointer; a white face
 def test_a_glare_on_the_pointer_or_a_white_face_does_not_mislead(seed: int) -> None:
     error, _ = error_of(draw_dial(seed))
     assert error is not None and error <= 2.0
@@ -64,7 +64,7 @@ def test_a_pointer_that_lightness_shows_well_is_not_doubted_for_its_displaced_co
     assert confidence > 0.8
 
 
-@pytest.mark.parametrize("seed", [5, 14, 15, 54, 91])  # wide bezels, whose outer edge is displaced
+@pytest.mark.parametrize("seed", [5, 14, 15, 54, 91])  # wide bezels with a displaced outer edge
 def test_a_pressure_gauge_is_read_about_the_middle_of_its_face_not_of_its_bezel(seed: int) -> None:
     error, _ = error_of(draw_manometer(seed))
     assert error is not None and error <= 2.0
@@ -80,7 +80,7 @@ def test_a_scale_of_another_span_is_read_by_where_its_ticks_end(name: str) -> No
 def test_ticks_that_do_not_show_at_one_end_do_not_move_the_scale(seed: int) -> None:
     error, confidence = error_of(draw_manometer(seed))
     assert error is not None and error <= 2.0
-    assert confidence <= BY_TICKS  # the ticks did contradict
+    assert confidence <= BY_TICKS  # the ticks contradicted
 
 
 @pytest.mark.parametrize("value", [0.6, 2.4, 4.9])

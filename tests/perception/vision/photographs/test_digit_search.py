@@ -1,4 +1,4 @@
-"""Rows of digits are found in pictures of which nothing is known; frames' sides are no ones."""
+"""Rows of digits are found in images without prior knowledge; sides of frames are not taken for ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_row_of_digits_is_found_where_it_lies(dark: bool, high: int) -> None:
     gray = np.full((300, 480), 120, np.uint8)
     display = window("2608", dark=dark, high=high, slant=0.08)
     gray[60 : 60 + display.shape[0], 90 : 90 + display.shape[1]] = display
-    rows = find_digit_rows(gray)[:ROWS_TRIED]  # what lies between digits looks like digits of the other polarity
+    rows = find_digit_rows(gray)[:ROWS_TRIED]  # the gaps between digits resemble digits of the other polarity
     row = next(row for row in rows if row.is_dark == dark)
     assert row.height == pytest.approx(high, rel=0.25)
     assert (row.top + row.bottom) / 2 == pytest.approx(60 + 0.35 * high + high / 2, abs=0.2 * high)

@@ -1,4 +1,4 @@
-"""One door to photographs: each kind by its reader, what cannot be meant refused, and real pictures."""
+"""Tests of the entry point for photographs: a reader per kind, refused requests, and real images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a scale ends, by its ticks alone: drawn faces of known ends, and such as have none."""
+"""Tests of finding the ends of a scale by its ticks only, on drawn faces with known ends and without ends."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MIDDLE_PX = 0.5 * (SIDE_PX - 1)
 
 
 def face(first_deg: float, last_deg: float, steps: int, *, light: bool = False, seed: int = 1) -> Image:
-    """Ticks from one angle to the other, 18 px long, in noise."""
+    """Draw ticks from one angle to the other, 18 px long, with noise."""
     ground, ink = (60, 220) if light else (220, 40)
     image = np.full((SIDE_PX, SIDE_PX), ground, np.uint8)
     for turn in np.deg2rad(np.linspace(first_deg, last_deg, steps + 1)):

@@ -1,4 +1,4 @@
-"""Random views of four lights, made with numpy alone."""
+"""Random views of four lights, computed by numpy only."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHAPES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """A true pose, camera_from_object, and exact pixels."""
+    """True pose, camera_from_object, and exact pixels."""
 
     points_m: Array
     R: Array
@@ -37,7 +37,7 @@ class View:
 
 
 def view(rng: np.random.Generator, shape: str, *, tilt_deg: float, range_m: float = 1.0) -> View:
-    """The shape seen from its front, tilted by `tilt_deg` against the line of sight, with any roll."""
+    """Return a view of the shape's front, tilted by `tilt_deg` from the line of sight, with random roll."""
     points = SHAPES[shape]
     normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
     sight = np.array([rng.uniform(-0.13, 0.13), rng.uniform(-0.13, 0.13), 1.0])
@@ -51,12 +51,12 @@ def view(rng: np.random.Generator, shape: str, *, tilt_deg: float, range_m: floa
 
 
 def pixels_of(points_m: Array, R: Array, t: Array) -> Array:
-    """(..., N, 2) pixels of `CAMERA` for (..., 3, 3) and (..., 3); NaN behind it."""
+    """Return (..., N, 2) pixels of `CAMERA` for rotations (..., 3, 3) and translations (..., 3); NaN behind it."""
     q = points_m @ R.swapaxes(-1, -2) + t[..., None, :]
     z = np.where(q[..., 2:] > 0, q[..., 2:], np.nan)
     return np.asarray(q[..., :2] / z * [CAMERA.fx_px, CAMERA.fy_px] + [CAMERA.cx_px, CAMERA.cy_px])
 
 
 def angle_deg(A: Array, B: Array) -> float:
-    """Angle between two rotations."""
+    """Return the angle between two rotations."""
     return float(np.degrees(Rotation.from_matrix(A @ B.T).magnitude()))

@@ -1,4 +1,4 @@
-"""The four-light pose: exact data, statistics, mirrors, every minimum, bad input."""
+"""Tests of the four-light pose: exact data, statistics, mirror poses, all minima, bad input."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def test_a_bent_lens_gives_the_same_pose() -> None:
 
 
 def brute_force_minima(true: View, pixels: Array, sigma_px: float, rng: np.random.Generator) -> list[float]:
-    """Chi-squares of the distinct minima that 50 random starts of scipy's solver reach."""
+    """Return the chi-squares of the distinct minima that scipy's solver reaches from 50 random starts."""
 
     def residuals(poses: Array) -> Array:
-        """(k, 8) for (k, 6) rotation vectors and translations."""
+        """Return residuals (k, 8) for (k, 6) rotation vectors and translations."""
         seen = pixels_of(true.points_m, Rotation.from_rotvec(poses[:, :3]).as_matrix(), poses[:, 3:])
         return np.nan_to_num((seen - pixels) / sigma_px, nan=1e3).reshape(len(poses), -1)
 
@@ -64,7 +64,7 @@ def brute_force_minima(true: View, pixels: Array, sigma_px: float, rng: np.rando
         return residuals(x[None])[0]
 
     def jacobian(x: Array) -> Array:
-        """Forward differences, as the solver would take them, all six at once."""
+        """Return forward differences as the solver would compute them, all six at once."""
         steps = np.sqrt(np.finfo(float).eps) * np.maximum(np.abs(x), 1e-3)
         both = residuals(np.vstack([x, x + np.diag(steps)]))
         return (both[1:] - both[0]).T / steps
@@ -121,7 +121,7 @@ def test_errors_match_the_covariance() -> None:
 
 
 def flipped(true: View, R: Array) -> bool:
-    """Scorer's rule of data/pose: nearer to the mirror of the true normal, and more than 5 degrees off."""
+    """Return whether a pose is flipped as in data/pose: nearer to the mirrored normal and more than 5 degrees off."""
     sight = true.R @ true.points_m.mean(axis=0) + true.t
     sight /= np.linalg.norm(sight)
     n, e = true.R[:, 2], R[:, 2]
@@ -131,7 +131,7 @@ def flipped(true: View, R: Array) -> bool:
 def test_a_mirrored_answer_is_flagged_and_the_truth_is_among_the_alternatives() -> None:
     pairs = solved(6, 400, tilt_deg=(0.0, 20.0), sigma_px=1.0, range_m=2.0)
     wrong = [(true, pose) for true, pose in pairs if flipped(true, pose.rotation)]
-    assert len(wrong) > 20  # the case is hard enough to say something
+    assert len(wrong) > 20  # enough cases for statistics
     assert sum(not pose.ambiguous for _, pose in wrong) <= 0.03 * len(pairs)
     flagged = [(true, pose) for true, pose in wrong if pose.ambiguous]
     listed = sum(any(not flipped(true, a.rotation) for a in pose.alternatives) for true, pose in flagged)
@@ -142,7 +142,7 @@ def test_the_probability_is_calibrated() -> None:
     pairs = solved(8, 500, tilt_deg=(0.0, 60.0), sigma_px=1.0, range_m=2.0)
     predicted = np.mean([1.0 - pose.probability for _, pose in pairs])
     happened = np.mean([flipped(true, pose.rotation) for true, pose in pairs])
-    # Uniform tilt weighs frontal views more than the solid angle does, so that it flips more often than predicted.
+    # Uniform tilt gives frontal views more weight than the solid angle, so there are more flips than predicted.
     assert 0.5 * predicted < happened < 2.0 * predicted
 
 

@@ -1,4 +1,4 @@
-"""The compiled three-point solver and the derivatives of the reprojection error."""
+"""Tests of the compiled three-point solver and of the derivatives of the reprojection error."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from perception.vision.quadrangle.cost import chi_square, expand, rotation_of
 from perception.vision.quadrangle.three_point import real_cubic_root, three_point
 from tests.perception.vision.quadrangle.quadrangle_cases import CAMERA, SHAPES, angle_deg, pixels_of, view
 
-DOUBLE_ROOT_PX = 0.5  # the solver also returns real parts of complex pairs; so near to its pixels it is a double root
+DOUBLE_ROOT_PX = 0.5  # real parts of complex pairs are also returned; with a smaller error they are double roots
 FULL = sorted(name for name in SHAPES if name != "three in a row")
 
 
 def three_light_poses(points_m: np.ndarray, pixels: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Every pose that puts three points on their pixels."""
+    """Return all poses that project three points to their pixels."""
     Rs, ts = np.empty((4, 3, 3)), np.empty((4, 3))
     count = three_point(np.ascontiguousarray(points_m), rays(np.ascontiguousarray(pixels), CAMERA), Rs, ts)
     found = [(Rs[k], ts[k]) for k in range(count)]
@@ -31,7 +31,7 @@ def test_every_three_light_pose_meets_its_pixels_and_one_is_the_truth(seed: int,
     poses = three_light_poses(true.points_m[:3], true.pixels[:3])
     assert 1 <= len(poses) <= 4
     nearest = min(angle_deg(R, true.R) for R, _ in poses)
-    assert nearest < 0.5  # near a double root the solution is only as good as the square root of the rounding
+    assert nearest < 0.5  # near a double root the accuracy is only the square root of the rounding error
     if nearest < 1e-3:
         for R, t in poses:
             np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)

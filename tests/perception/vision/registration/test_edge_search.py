@@ -1,4 +1,4 @@
-"""The compiled search for edges against plain numpy, and on an edge whose place is known."""
+"""Compares the compiled search for edges with plain numpy, and tests it on an edge at a known place."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perception.vision.registration.edge_search import STEP_PX, strongest_edges
 
 
 def in_numpy(smooth: np.ndarray, points: Array, normals: Array, window_px: float) -> tuple[Array, Array, np.ndarray]:
-    """`strongest_edges` as whole arrays."""
+    """Return the result of `strongest_edges`, computed with whole arrays."""
     t = np.arange(-window_px - STEP_PX, window_px + 1.5 * STEP_PX, STEP_PX)
     u, v = points[:, :1] + normals[:, :1] * t, points[:, 1:] + normals[:, 1:] * t
     height, width = smooth.shape

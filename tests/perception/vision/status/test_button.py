@@ -1,4 +1,4 @@
-"""A cap's height from the side, with a ring of its own gray round it; from ahead, the gap round it."""
+"""Tests of buttons seen from the side, with a ring of the cap's gray around it, and from straight ahead."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from perception.vision.patch import Patch
 from perception.vision.status.button import read_button
 
 SIZE, PX_PER_M = 160, 2500.0
-LEAN = 0.42  # tangent of the angle that the camera looks from
+LEAN = 0.42  # tangent of the camera's viewing angle
 BUTTON = Button(kind="button", name="hold", position_m=(0.0, 0.0), radius_m=0.013, latching=True)
 
 
 def seen_aslant(height_m: float, *, cap: int, ring: int, ring_m: float = 0.0157) -> Patch:
-    """A cap that stands `height_m` out, on a flat ring on a bright plate."""
+    """Draw a cap that protrudes by `height_m`, on a flat ring on a bright plate."""
     middle = (SIZE - 1) / 2
     parallax = np.array([LEAN * PX_PER_M, 0.0])
 
@@ -48,7 +48,7 @@ def test_a_bright_cap_on_a_dark_ring_is_read() -> None:
 @pytest.mark.parametrize("depth", [0.6, 0.8, 1.0])
 @pytest.mark.parametrize("ring_m", [0.0152, 0.0157, 0.0162])
 def test_the_ring_round_a_black_cap_is_not_taken_for_its_edge(depth: float, ring_m: float) -> None:
-    """The ring's edge lies where that of a released cap would be."""
+    """The edge of the ring is where that of a released cap would be."""
     patch = seen_aslant(BUTTON.height_m - depth * BUTTON.travel_m, cap=18, ring=20, ring_m=ring_m)
     assert read_button(patch, BUTTON).state in ("pressed", None)
 
@@ -62,7 +62,7 @@ def test_a_latched_cap_is_less_deep_than_one_that_is_held() -> None:
 
 
 def seen_straight(*, is_released: bool, cable_at_m: float | None = None, glare_at_m: float | None = None) -> Patch:
-    """A dark cap in a black ring and a bright collar, without heights; beside it a cable or a glare, at so much to the right."""
+    """Draw a dark cap in a black ring and a bright collar, without heights, with a cable or a glare to its right."""
     half = (SIZE - 1) / 2
     picture = np.full((SIZE, SIZE), 140.0, np.float32)
 
@@ -113,7 +113,7 @@ def test_a_glare_beside_a_flush_cap_is_not_its_shine(glare_at_m: float) -> None:
 
 
 def test_a_cap_too_bright_to_shine_is_not_surely_pressed() -> None:
-    """Its face and its plate are near white: a shine could not show, and its shadow is washed out."""
+    """Cap and plate are nearly white, so highlights are invisible and the shadow is faint."""
     clear = seen_straight(is_released=True)
     bright = np.clip(np.round(225 + 0.08 * (clear.gray.astype(float) - 60)), 0, 255).astype(np.uint8)
     status = read_button(replace(clear, gray=bright), BUTTON)
@@ -122,7 +122,7 @@ def test_a_cap_too_bright_to_shine_is_not_surely_pressed() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_noise_of_a_black_cap_is_not_its_shine(seed: int) -> None:
-    """In a dark picture a camera's noise is largest where it is darkest."""
+    """In a dark image the noise of a camera is largest in the darkest parts."""
     clear = seen_straight(is_released=False)
     linear = (0.45 * clear.gray.astype(float) / 255) ** 2.2
     rough = cv2.resize(np.random.default_rng(seed).normal(0.0, 1.0, (SIZE * 2 // 3,) * 2), (SIZE, SIZE))
@@ -132,7 +132,7 @@ def test_the_noise_of_a_black_cap_is_not_its_shine(seed: int) -> None:
 
 
 def seen_from_ahead(below_px: float) -> Patch:
-    """A bright cap without shine in a dark gap that is thicker below by so much, of a homography's view."""
+    """Draw a bright cap without highlight in a dark gap that is `below_px` thicker below, as seen by a homography."""
     middle = (SIZE - 1) / 2
     picture = np.full((SIZE, SIZE), 130, np.uint8)
     R = BUTTON.radius_m * PX_PER_M
@@ -148,7 +148,7 @@ def seen_from_ahead(below_px: float) -> Patch:
 
 
 def test_a_cap_whose_gap_is_dark_below_is_not_called_pressed() -> None:
-    """Its side shows below. Without a spot of shine it was pressed at .97."""
+    """The side of the cap is visible below it, so the missing highlight must not make it pressed."""
     assert read_button(seen_from_ahead(4.0), BUTTON).state in ("released", None)
     for below_px in (0.0, -4.0):
         assert read_button(seen_from_ahead(below_px), BUTTON).state == "pressed"

@@ -1,4 +1,4 @@
-"""Cables across round faces and levers: what they hide is known, and they are no pointer and no handle."""
+"""Cables across round faces and levers: what they hide is known, and they are not taken for pointers or handles."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def towards(angle_rad: float, reach_px: float) -> tuple[int, int]:
 
 
 def dark_face(value: float) -> NDArray[np.uint8]:
-    """A black gauge with a white pointer on a bright plate."""
+    """Draw a black gauge with a white pointer on a bright plate."""
     picture = np.full((SIZE, SIZE), 170, np.uint8)
     cv2.circle(picture, (MIDDLE, MIDDLE), round(RADIUS_M * PX_PER_M), 30, -1, cv2.LINE_AA)
     angle = SCALE.place_of(value)
@@ -63,7 +63,7 @@ def dark_face(value: float) -> NDArray[np.uint8]:
 
 
 def hung(picture: NDArray[np.uint8], xs: tuple[int, int, int], gray: int) -> NDArray[np.uint8]:
-    """A cable from top to bottom with a bend, through three columns."""
+    """Draw a cable from top to bottom with a bend, through three columns."""
     points = np.array([[xs[0], -5], [xs[1], MIDDLE], [xs[2], SIZE + 5]])
     cv2.polylines(picture, [points], False, gray, 12, cv2.LINE_AA)
     return picture
@@ -74,7 +74,7 @@ def hung(picture: NDArray[np.uint8], xs: tuple[int, int, int], gray: int) -> NDA
 def test_a_pointer_beside_a_cable_is_read(value: float, xs: tuple[int, int, int]) -> None:
     status = read_gauge(patch_of(hung(dark_face(value), xs, 85)), GAUGE)
     assert status.value is None or status.value == pytest.approx(value, abs=0.2)
-    if xs[1] != 112:  # that one lies over the pivot: to refuse is right there
+    if xs[1] != 112:  # that cable is over the pivot, so a refusal is right
         assert status.answered
 
 
@@ -92,7 +92,7 @@ def test_a_bent_cable_is_masked_and_little_else() -> None:
 
 @pytest.mark.parametrize("knee", [(85, 125), (95, 95), (100, 150)])
 def test_a_thick_bent_cable_is_masked_to_its_edges(knee: tuple[int, int]) -> None:
-    """A strip left over beside the mask would pass for a pointer."""
+    """A strip of the cable beside the mask could be taken for a pointer."""
     cable = np.zeros((SIZE, SIZE), np.uint8)
     cv2.polylines(cable, [np.array([[-5, 60], knee, [100, SIZE + 5]])], False, 1, 36, cv2.LINE_8)
     picture = np.full((SIZE, SIZE), 170, np.uint8)
@@ -116,7 +116,7 @@ def test_a_pointer_of_an_uncertain_direction_is_refused() -> None:
 
 
 def test_a_rival_where_nothing_else_should_stand_makes_a_pointer_unsure() -> None:
-    """A meter has no numerals where its pointer is looked for; a gauge has."""
+    """A meter has no numerals where its pointer is searched for, but a gauge has."""
     fit = PointerFit(
         angle_rad=0.1, sigma_rad=0.005, strength=50.0, contrast=30.0, rival_ratio=0.3, rival_rad=0.5, supported=1.0,
         shown=1.0, is_dark=True, unknown=0.1,
@@ -126,7 +126,7 @@ def test_a_rival_where_nothing_else_should_stand_makes_a_pointer_unsure() -> Non
 
 
 def slider(cap_middle: int, hose: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """A dark cap, 54 px long, on a slot, and a hose of the cap's length across: its middle above and below the track."""
+    """Draw a dark cap 54 px long on a slot, and a hose of the cap's width across it, given by its ends."""
     picture = np.full((SIZE, SIZE), 170, np.uint8)
     cv2.rectangle(picture, (20, MIDDLE - 3), (220, MIDDLE + 3), 25, -1)
     cv2.rectangle(picture, (cap_middle - 27, MIDDLE - 30), (cap_middle + 27, MIDDLE + 30), 35, -1)
@@ -145,7 +145,7 @@ def test_a_hose_as_wide_as_the_cap_is_no_cap() -> None:
 
 @pytest.mark.parametrize("seed", [10035, 10280])
 def test_a_label_that_leads_into_the_slot_does_not_hide_the_track(seed: int) -> None:
-    """Followed by its gray, a faint word below a track is its slot and its cap; a cable comes out at another side."""
+    """A faint word below a track leads into slot and cap if followed by its gray; a cable comes out at another side."""
     rows = [row for row in read_scene(draw_scene(seed, "hard")) if row.kind == "slider"]
     assert rows and all(row.is_right for row in rows)
 
@@ -157,7 +157,7 @@ def test_cables_that_may_be_spokes_make_a_wheel_unsure(seed: int) -> None:
 
 
 def test_a_cable_of_the_faces_own_gray_does_not_hide_the_face() -> None:
-    """Its gray would lead a search by gray all over the face and its rim."""
+    """A search for the cable's gray would cover the whole face and its rim."""
     status = read_gauge(patch_of(hung(dark_face(6.0), (80, 84, 150), 34), noise=4.0), GAUGE)
     assert status.value == pytest.approx(6.0, abs=0.1)
 
@@ -182,7 +182,7 @@ def test_a_handle_that_a_cable_crosses_is_read() -> None:
 
 
 def lens(radius_px: int, gray: int, xs: tuple[int, int, int] | None) -> Patch:
-    """A lamp's lens with a dark bezel on the plate, and a cable of that gray before it."""
+    """Draw a lamp's lens with a dark bezel on the plate, and a cable of the bezel's gray in front of it."""
     picture = np.full((SIZE, SIZE), 150, np.uint8)
     cv2.circle(picture, (MIDDLE, MIDDLE), round(1.2 * radius_px), 40, -1, cv2.LINE_AA)
     cv2.circle(picture, (MIDDLE, MIDDLE), radius_px, gray, -1, cv2.LINE_AA)
@@ -210,7 +210,7 @@ def test_a_bar_is_told_by_its_known_stations() -> None:
     patch = patch_of(lever(0.0))
     hidden = np.zeros((SIZE, SIZE), bool)
     hidden[45:60] = True
-    patch.gray[hidden] = 75  # what lies across has the bar's gray
+    patch.gray[hidden] = 75  # the cable has the bar's gray
     bar = {"along_m": (0.012, 0.026), "half_width_m": 0.004}
     seen = bar_contrast(patch, 0.0, hidden=hidden, **bar)[0]
     assert seen == pytest.approx(-95.0, abs=5.0)
@@ -228,7 +228,7 @@ def test_an_easy_drawn_panel_is_read_and_recognised() -> None:
 
 @pytest.mark.parametrize("seed", [20044, 20064])
 def test_a_number_that_leaves_strokes_over_is_refused(seed: int) -> None:
-    """A grid that lay wrong read 4.94 as 4.44 at .95, and a cable of the window's gray made 7.14 of 7.11."""
+    """A misplaced grid may read 4.94 as 4.44, and a cable of the window's gray 7.11 as 7.14."""
     case = draw_taught(seed, "hard")
     status = read_case(case, known=False)
     assert status.text in (case.text, None)
@@ -237,13 +237,13 @@ def test_a_number_that_leaves_strokes_over_is_refused(seed: int) -> None:
 def test_stray_ink_is_what_no_lit_segment_accounts_for() -> None:
     grid = DigitGrid(left_px=10.0, pitch_px=30.0, width_px=18.0, top_px=12.0, bottom_px=52.0, slant=0.0, count=2)
     lit = np.zeros((2, 7))
-    lit[:, [1, 2]] = 100.0  # 11
+    lit[:, [1, 2]] = 100.0  # shows 11
     ink = np.zeros((64, 80), np.float32)
     for x in (28, 58):
         cv2.line(ink, (x, 14), (x, 50), 100.0, 4)
     assert stray_ink(ink, grid, lit) < 0.01
     assert stray_ink(ink + 15.0, grid, lit) < 0.02, "an even ground is no stroke"
-    cv2.line(ink, (42, 12), (54, 12), 100.0, 4)  # what makes the second one a 7
+    cv2.line(ink, (42, 12), (54, 12), 100.0, 4)  # makes the second digit a 7
     assert stray_ink(ink, grid, lit) > 0.1
     lit[1, 0] = 100.0
     assert stray_ink(ink, grid, lit) < 0.03

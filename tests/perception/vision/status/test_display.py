@@ -1,4 +1,4 @@
-"""Seven-segment windows drawn with known text, size, slant, blur and noise."""
+"""Tests of seven-segment windows drawn with known text, size, slant, blur and noise."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def window(
     pitch: float = 1.5,
     contrast: float = 150.0,
 ) -> np.ndarray:
-    """A window with the text, drawn four times larger and reduced."""
+    """Return a window with the text, drawn at four times the size and reduced."""
     digits = sum(c != "." for c in text)
     width = 0.5 * high
     size = (round(1.7 * high), round(digits * pitch * width + 0.6 * high))

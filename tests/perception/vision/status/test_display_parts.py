@@ -1,4 +1,4 @@
-"""The parts of the display reader: characters by likelihood, the grid's worth, cables, the point; and own renderings."""
+"""Tests of the display reader's parts: likelihood of characters, score of the grid, cables, the point."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_clear_segments_say_one_number(text: str) -> None:
 
 
 def test_what_a_hidden_segment_decides_stays_open() -> None:
-    b = 1  # upper right: 5 or 9
+    b = 1  # upper right segment: distinguishes 5 and 9
     listed = numbers(*likelihoods(levels_of("19", hidden=((1, b),))))
     assert {n.characters for n in listed[:2]} == {"15", "19"}
     assert listed[0].log_likelihood == pytest.approx(listed[1].log_likelihood, abs=0.1)
@@ -74,14 +74,14 @@ def test_a_refusal_lists_what_it_may_be_for_programs() -> None:
     gray = window("99", slant=0.0)
     status = read_window(gray, digits=2, decimals=0, dark=False, limits=(0.0, 200.0), hidden=over_segment_b(gray))
     first, second = status.possible[:2]
-    assert (first.text, first.value) == ("99", 99.0)  # of equally likely ones the one further from zero
+    assert (first.text, first.value) == ("99", 99.0)  # of equally likely numbers the one further from zero
     assert second.text == "59" and second.probability == pytest.approx(first.probability, rel=0.01)
     assert status.confidence == first.probability and sum(p.probability for p in status.possible) <= 1.0
-    assert not read_window(gray, digits=2, decimals=0, dark=False).possible  # nothing is hidden: an answer
+    assert not read_window(gray, digits=2, decimals=0, dark=False).possible  # nothing is hidden, so it is answered
 
 
 def over_segment_b(gray: np.ndarray) -> np.ndarray:
-    """Mask over the upper right segment of the first of two digits in `window`."""
+    """Return a mask over the upper right segment of the first of two digits in `window`."""
     hidden = np.zeros(gray.shape, bool)
     left = 0.5 * (gray.shape[1] - 1.5 * 20 - 20)
     hidden[17:32, round(left + 20 - 5) : round(left + 20 + 4)] = True
@@ -127,7 +127,7 @@ def test_sliding_medians_of_a_ring_are_its_medians(size: int) -> None:
 
 
 def in_glare(gray: np.ndarray, added: float) -> np.ndarray:
-    """The window under a glare at its right end: light adds up, then the camera codes it."""
+    """Return the window with a glare at its right end, added in linear light."""
     columns = np.arange(gray.shape[1]) / gray.shape[1]
     light = 0.5 * (gray / 255.0) ** 2.2 + added * np.exp(-((columns - 0.95) ** 2) / (2 * 0.3**2))
     return np.asarray(np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)), np.uint8)
@@ -152,7 +152,7 @@ def test_a_window_in_glare_is_read(text: str, added: float) -> None:
 def test_a_blank_within_a_number_is_a_digit_that_nobody_saw() -> None:
     gray = window("4972", slant=0.0)
     wiped = gray.copy()
-    wiped[:, 78:102] = 20  # the 7, by a cable of the window's gray
+    wiped[:, 78:102] = 20  # a cable of the window's gray hides the 7
     assert read_window(gray, digits=None, decimals=0, dark=False, bare=True).text == "4972"
     status = read_window(wiped, digits=None, decimals=0, dark=False, bare=True)
     assert not status.answered and status.confidence < 0.1
@@ -176,14 +176,14 @@ def test_a_dot_that_a_cable_hides_in_part_is_found_and_a_bare_part_of_a_gap_says
         ink, seen = segment_ink(window(text, slant=0.0), is_dark=False)
         _, grid = find_digit_grids(ink, seen)[0]
         middle = round(grid.left_px + 1.5 * grid.pitch_px + 0.5 * grid.width_px)
-        seen[:, middle - 6 : middle] = 0.0  # the left half of the second gap
+        seen[:, middle - 6 : middle] = 0.0  # hides the left half of the second gap
         assert not dot_levels(ink, seen, grid, lit)[1][1]
         found = find_decimal_point(ink, seen, grid, lit)
         assert found.place == place and (found.probability > 0.95 if place else found.probability < 0.8)
 
 
 def test_a_dot_in_both_gaps_is_no_number_without_a_point() -> None:
-    """What every gap seems to have is not what a bare gap has: strokes that are not where they are thought to be."""
+    """Ink in every gap is not the normal level of a gap, but means that the strokes are not where they are assumed."""
     lit = np.array([LIT[NAMES.index(c)] * 150.0 for c in "264"])
     ink, seen = segment_ink(window("264", slant=0.0), is_dark=False)
     _, grid = find_digit_grids(ink, seen)[0]
@@ -208,7 +208,7 @@ def plate_patch(*, cable: tuple[int, int] | None, cable_gray: int = 60) -> Patch
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("gray", [60, 170])  # nearly the window's, and the plate's own
+@pytest.mark.parametrize("gray", [60, 170])  # nearly the gray of the window, and that of the plate
 @pytest.mark.parametrize("cable", [(100, 100), (60, 95), (150, 120)])
 def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int], gray: int) -> None:
     patch = plate_patch(cable=cable, cable_gray=gray)
@@ -219,7 +219,7 @@ def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int], gray: int) -> N
     inside = np.zeros(found.shape, bool)
     inside[25:85, 30:170] = True
     assert found[(drawn > 0) & inside].mean() > 0.97
-    assert found[inside].mean() < 0.3  # the cable is 12 px of 140 wide
+    assert found[inside].mean() < 0.3  # the cable takes 12 px of 140
 
 
 def test_a_cable_in_a_dark_picture_is_masked_too() -> None:
@@ -259,9 +259,9 @@ def test_cells_beside_a_grid_belong_to_it_where_they_are_hidden() -> None:
     seen[:, 150:165] = 0.0
     grid = DigitGrid(left_px=60.0, pitch_px=30.0, width_px=15.0, top_px=8.0, bottom_px=32.0, slant=0.1, count=3)
     assert with_hidden_ends(seen, grid, 8) == replace(grid, count=4)
-    assert with_hidden_ends(seen, grid, 3) == grid  # the display has no more
+    assert with_hidden_ends(seen, grid, 3) == grid  # the display has no more digits
     assert with_hidden_ends(seen[:, ::-1].copy(), grid, 8) == replace(grid, left_px=30.0, count=4)
-    assert with_hidden_ends(seen[:, :160], grid, 8) == grid  # no room for a fourth
+    assert with_hidden_ends(seen[:, :160], grid, 8) == grid  # no space for a fourth digit
 
 
 @pytest.mark.parametrize(("seed", "level"), [(5010, "easy"), (5172, "hard")])
@@ -276,7 +276,7 @@ def test_photographs_of_low_contrast_are_read_by_and_large() -> None:
 
 
 def washed_out(text: str, *, glare_from: float) -> np.ndarray:
-    """A dark-inked window in light that saturates its ground, and from a share of its width on its segments too."""
+    """Return a window with dark segments and saturated background, where the right segments saturate, too."""
     gray = window(text, dark=True, slant=0.0, contrast=120.0).astype(float) + 90.0
     gray[:, round(glare_from * gray.shape[1]) :] += 140.0
     return np.clip(gray, 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""States that drawn panels show plainly: refusing them is no caution."""
+"""States that are clearly visible in drawn panels must be read and not refused."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from benchmarks.panel_scene import draw_scene
 from benchmarks.vision_held_out import read_scene
 
 GRAY_POINTERS = (70029, 70042)  # on dark faces, beside brighter numerals
-CABLES_BESIDE_A_CAP = (70062, 70080)  # whose own edge would do for a cap under the cable
-FAINT_LENSES = (70066, 70028)  # unlit ones at .75 and .80 of the plate's gray
-BATS_LIKE_THE_PLATE = (70023, 70040)  # that stand out from the nut about their foot alone
-WIDE_BAT = 70001  # what is beside a bat of the usual width is still the bat
-CABLE_OVER_ONE_SIDE = 70072  # a dark bar where the bat would be if it leaned the other way
+CABLES_BESIDE_A_CAP = (70062, 70080)  # the cable's edge could be that of a cap under it
+FAINT_LENSES = (70066, 70028)  # unlit lenses at 0.75 and 0.80 of the plate's gray
+BATS_LIKE_THE_PLATE = (70023, 70040)  # have contrast only with the nut at their foot
+WIDE_BAT = 70001  # wider than the usual bat
+CABLE_OVER_ONE_SIDE = 70072  # a dark bar where the bat would be in the other state
 
 
-CABLES_BESIDE_A_FACE = (70009, 70084)  # whose gray a dark face or a shaded one has
+CABLES_BESIDE_A_FACE = (70009, 70084)  # the face is dark or shaded and has the cable's gray
 
 
 @pytest.mark.parametrize("seed", FAINT_LENSES)

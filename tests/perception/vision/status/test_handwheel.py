@@ -1,4 +1,4 @@
-"""Wheels that are seen a little beside their place: their angle must not turn with that."""
+"""The angle of a handwheel must not depend on a small error of its position."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CORNERS = ((-0.15, 0.12), (0.15, 0.12), (0.15, -0.12), (-0.15, -0.12))
 
 
 def read(spokes: int, *, beside_m: tuple[float, float], seed: int = 1) -> PatchReading:
-    """A small wheel 0.3 m away, read where it would be if the panel's pose were right."""
+    """Read a small wheel 0.3 m away at its place by a panel pose that is slightly wrong."""
     wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.026, rim_m=0.004, height_m=HEIGHT_M, spokes=spokes)
     lights = tuple(Light(name=f"light_{k}", position_m=(x, y, 0.0005)) for k, (x, y) in enumerate(CORNERS))
     panel = Panel(schema=1, name="small", width_m=0.34, height_m=0.28, lights=lights, objects=(wheel,))
@@ -39,7 +39,7 @@ def read(spokes: int, *, beside_m: tuple[float, float], seed: int = 1) -> PatchR
 @pytest.mark.parametrize("spokes", [3, 4, 5])
 @pytest.mark.parametrize("towards_rad", np.linspace(0.0, 2.0 * np.pi, 6, endpoint=False))
 def test_a_wheel_one_millimetre_beside_its_place_keeps_its_angle(spokes: int, towards_rad: float) -> None:
-    """The share of the spokes that moved alike gave it: 0.06 rad of a small wheel in a mission, and a false `done`."""
+    """A common shift of the spokes must not be read as a rotation; 0.06 rad of a small wheel make a false `done`."""
     status = read(spokes, beside_m=(0.001 * float(np.cos(towards_rad)), 0.001 * float(np.sin(towards_rad))))
     assert status.value is not None and status.uncertainty is not None
     off_rad = abs(float(wrapped(np.array(status.value - ANGLE_RAD))))
@@ -48,7 +48,7 @@ def test_a_wheel_one_millimetre_beside_its_place_keeps_its_angle(spokes: int, to
 
 
 def test_where_nothing_shows_nothing_is_read() -> None:
-    """Heights of nothing over nothing were NaN, and the reader ended with an error."""
+    """Without any contrast the ratio of heights is 0/0, which must not end in an error."""
     wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.026, rim_m=0.004, height_m=HEIGHT_M, spokes=4)
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=DISTANCE_M, tilt_rad=0.0)))
     view = CameraProjection(intrinsics=camera(focal_px=460.0), camera_from_panel=pose)
@@ -61,7 +61,7 @@ def test_where_nothing_shows_nothing_is_read() -> None:
 def test_a_spoke_that_differs_within_the_wheels_own_grays_is_not_surely_the_marked_one(
     mark: int | None, is_sure: bool
 ) -> None:
-    """A thing in front made one spoke unlike the others, and the mark of another was hidden: sure, and a quarter turn off."""
+    """If something makes one spoke differ and the mark of another is hidden, a wrong quarter turn must not be sure."""
     px_per_m, middle, R = 2000.0, np.full(2, 99.5), 60.0
     wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.030, rim_m=0.004, height_m=HEIGHT_M, spokes=4)
     picture = np.full((200, 200), 170, np.uint8)

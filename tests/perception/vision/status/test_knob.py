@@ -1,4 +1,4 @@
-"""Knobs drawn at known angles: the value under the mark, and a refusal where there is none."""
+"""Knobs drawn at known angles: the value at the mark is read, and knobs without mark are refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PX_PER_M, SIDE = 4000.0, 200
 
 
 def patch_of(angle_rad: float | None, seed: int = 0) -> Patch:
-    """A dark knob on a bright plate, with a bright mark towards an angle, and noise."""
+    """Draw a dark knob on a bright plate, with a bright mark at an angle, and noise."""
     v, u = np.mgrid[:SIDE, :SIDE]
     x, y = (u - (SIDE - 1) / 2) / PX_PER_M, -(v - (SIDE - 1) / 2) / PX_PER_M
     r = np.hypot(x, y)

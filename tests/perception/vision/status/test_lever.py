@@ -1,4 +1,4 @@
-"""Levers whose handle shows by its shadow alone, and levers that stand between their states."""
+"""Levers whose handle is visible by its shadow only are read, and levers between their states are refused."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def patch_of(picture: NDArray[np.float32], seed: int) -> Patch:
 
 
 def drawn(angle_rad: float, handle: float, shadow: float | None) -> NDArray[np.float32]:
-    """A plate of gray 200 with a handle, and a shadow along its right side."""
+    """Draw a plate of gray 200 with a handle, and a shadow along its right side."""
     picture = np.full((SIZE, SIZE), 200.0, np.float32)
     along = np.array([np.sin(angle_rad), -np.cos(angle_rad)])
     across = np.array([-along[1], along[0]])
@@ -64,7 +64,7 @@ def test_a_handle_between_its_states_is_refused(off_rad: float) -> None:
 
 @pytest.mark.parametrize(("handle", "state"), [(84.0, "open"), (100.0, None)])
 def test_a_handle_beside_a_glare_is_read_and_the_glare_alone_is_none(handle: float, state: str | None) -> None:
-    """The plate on the glare's side is far brighter than the handle, that on the other side hardly."""
+    """The plate is far brighter than the handle on the side of the glare, and hardly brighter on the other side."""
     picture = drawn(float(np.pi / 2), 2 * handle, None) / 2
     v, u = np.mgrid[:SIZE, :SIZE]
     picture += 120.0 * np.exp(-((u - 220.0) ** 2 + (v - 90.0) ** 2) / (2 * 45.0**2))

@@ -1,4 +1,4 @@
-"""A dim pointer on a dark face: the bright numeral that it touches must not turn it, and none stands in for it."""
+"""A bright numeral that touches a dim pointer on a dark face must neither turn the pointer nor replace it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SIZE, RADIUS_M, PX_PER_M = 240, 0.045, 2200.0
 
 
 def face(angle_rad: float, seed: int) -> Patch:
-    """A dark face with a dim pointer, and a bright numeral 8 degrees beside it."""
+    """Draw a dark face with a dim pointer, and a bright numeral 8 degrees beside it."""
     middle = np.full(2, SIZE / 2)
     picture = np.full((SIZE, SIZE), 35.0, np.float32)
     R = RADIUS_M * PX_PER_M
@@ -50,7 +50,7 @@ def test_a_bright_numeral_beside_a_dim_pointer_does_not_turn_it(angle_deg: float
 
 @pytest.mark.parametrize("angle_deg", [-100.0, 20.0, 100.0])
 def test_bright_numerals_that_do_not_reach_the_hub_are_no_pointer(angle_deg: float) -> None:
-    """At the end of the scale stood a 10: 4.5 bar was read as 9.9, and surely."""
+    """The numeral 10 at the end of the scale must not be taken for the pointer, or 4.5 bar is read as 9.9."""
     R, angle_rad = RADIUS_M, float(np.deg2rad(angle_deg))
     patch = face(angle_rad, 0)
     middle, numerals = np.full(2, SIZE / 2), angle_rad + np.pi / 2

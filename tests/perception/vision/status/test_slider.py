@@ -1,4 +1,4 @@
-"""Sliders whose cap leans over its foot: a camera before the track's middle sees the inner side of a cap at its end."""
+"""The side of a cap, which a camera in front of the track's middle sees, must not shift the reading of a slider."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCALE = Scale(minimum=0.0, maximum=100.0, unit="%", at_min=-TRAVEL_M / 2, at_max
 @pytest.mark.parametrize("angle_rad", [0.0, np.pi / 2])
 @pytest.mark.parametrize("shown", [8.0, 28.0, 38.0, 50.0, 62.0, 72.0, 92.0])
 def test_a_close_up_reads_a_cap_beside_the_middle_of_its_track(shown: float, angle_rad: float) -> None:
-    """It was read up to 1.1 mm nearer to the middle, and 27.7 was called 28.7 and done for 30 +- 2."""
+    """If the side of the cap is included, the reading is up to 1.1 mm nearer to the middle."""
     slider = Slider(name="speed", position_m=(0.0, 0.0), angle_rad=angle_rad, travel_m=TRAVEL_M, scale=SCALE)
     lights = tuple(Light(name=f"light_{k}", position_m=(x, y, 0.0005)) for k, (x, y) in enumerate(CORNERS))
     panel = Panel(schema=1, name="small", width_m=0.34, height_m=0.28, lights=lights, objects=(slider,))
@@ -40,7 +40,7 @@ def test_a_close_up_reads_a_cap_beside_the_middle_of_its_track(shown: float, ang
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("shown", [20.0, 71.0])
 def test_the_shadow_of_a_cap_does_not_move_it(shown: float, side: int) -> None:
-    """A shadow of nearly the cap's gray pulled its edge: 80.2 was read as 82.9, and surely."""
+    """A shadow of nearly the cap's gray must not shift its edge, or 80.2 is read as 82.9."""
     px_per_m, middle = 2500.0, np.array([169.5, 69.5])
     slider = Slider(name="flow", position_m=(0.0, 0.0), angle_rad=0.0, travel_m=TRAVEL_M, scale=SCALE)
     along, across = (k * px_per_m for k in slider.cap_size_m[:2])

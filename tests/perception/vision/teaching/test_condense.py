@@ -1,4 +1,4 @@
-"""Condensing taught looks: what the kept ones tell with a margin is left out."""
+"""Condensing leaves out the taught looks that the kept ones recognise with a margin."""
 
 from __future__ import annotations
 

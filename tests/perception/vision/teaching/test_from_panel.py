@@ -1,4 +1,4 @@
-"""A known panel teaches its own looks: what blind recognition says before and after, and what teaches nothing."""
+"""Tests of teaching looks from a known panel: blind recognition before and after, and images that teach nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def lesson() -> PanelLooks:
 
 
 def right(knowledge: Knowledge) -> tuple[set[str], list[Detection]]:
-    """Names of the objects that are found in another overview with other states, and the accepted candidates."""
+    """Return the objects found in another overview with other states, and the accepted candidates."""
     image, _, _ = scene(
         tilt_deg=11.0, azimuth_deg=200.0, distance_m=0.7, shown={"pressure": 2.0, "mode": "low", "drain": -0.4}, seed=5
     )
@@ -98,7 +98,7 @@ def test_a_panel_that_is_not_where_the_pose_has_it_teaches_nothing() -> None:
 
 
 def test_a_panel_of_which_most_is_elsewhere_teaches_nothing() -> None:
-    """What lay where chance had it taught."""
+    """Otherwise the looks of arbitrary places would be taught."""
     bare = [(-0.26 + 0.04 * k, 0.06) for k in range(14)]
     more = [Lamp(kind="lamp", name=f"lamp_{k}", position_m=place, radius_m=0.01) for k, place in enumerate(bare)]
     other = panel().model_copy(update={"objects": (*panel().objects, *more)})

@@ -1,4 +1,4 @@
-"""Kinds that nobody thought of, taught by three clicks an image, are found in other images, and cost no known kind."""
+"""New kinds taught by three clicks per image are found in other images, without loss of known kinds."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def counter(canvas: Canvas, random: np.random.Generator) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NewKind:
-    """How it is drawn, its size (m), where it is when it is taught and where it is looked for."""
+    """New kind: how it is drawn, its size (m), its place when it is taught, and its place when it is searched for."""
 
     name: str
     paint: Callable[[Canvas, np.random.Generator], None]
@@ -69,7 +69,7 @@ KINDS = (
 
 
 def drawn(seed: int, *, taught: bool) -> tuple[Canvas, CameraProjection]:
-    """The test panel with one of each new kind in a state of its own, from another place for each seed."""
+    """Draw the test panel with one object of each new kind, with random states and a random camera pose per seed."""
     random = np.random.default_rng([20261122, seed])
     tilt_deg, azimuth_deg = random.uniform(0.0, 8.0), random.uniform(0.0, 360.0)
     image, lens, pose = scene(tilt_deg=tilt_deg, azimuth_deg=azimuth_deg, distance_m=0.68, pose_error=0.0, seed=seed)
@@ -88,7 +88,7 @@ def drawn(seed: int, *, taught: bool) -> tuple[Canvas, CameraProjection]:
 
 
 def clicks(view: CameraProjection, kind: NewKind) -> list[tuple[float, float]]:
-    """Two opposite corners and the middle, as a person clicks them."""
+    """Return two opposite corners and the centre, as a person clicks them."""
     (x, y), (w, h) = kind.taught_m, kind.size_m
     points = view.project([[x - w / 2, y + h / 2, 0.0], [x + w / 2, y - h / 2, 0.0], [x, y, 0.0]])
     return [(float(u), float(v)) for u, v in points.round()]
@@ -96,7 +96,7 @@ def clicks(view: CameraProjection, kind: NewKind) -> list[tuple[float, float]]:
 
 @pytest.fixture(scope="module")
 def taught() -> Knowledge:
-    """Three examples each: a bar graph with other bars lit looks different."""
+    """Teach three examples of each, because a bar graph with other bars lit looks different."""
     knowledge = load_knowledge()
     for seed in (1, 11, 12):
         image, view = drawn(seed, taught=True)
@@ -107,7 +107,7 @@ def taught() -> Knowledge:
 
 
 def found(image: Canvas, view: CameraProjection, knowledge: Knowledge) -> set[str]:
-    """Names of the panel's objects, and new kinds, that are found where they are."""
+    """Return the names of the panel's objects and the new kinds that are found at their places."""
     hits = [c for c in check(image, knowledge, plate_m=PLATE, view=view) if c.reason is None]
     places = [(panel_object.name, str(panel_object.kind), panel_object.position_m) for panel_object in panel().objects]
     places += [(kind.name, kind.name, kind.asked_m) for kind in KINDS]

@@ -1,4 +1,4 @@
-"""A whole panel is taught from one image: outlines under clicks, lights, answers; what was taught is then read."""
+"""A whole panel is taught from one image by clicked outlines, lights and answers, and is then read."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def seen() -> tuple[np.ndarray, CameraProjection, Overview]:
 
 
 def corners_of(view: CameraProjection, name: str) -> list[tuple[float, float]]:
-    """Two opposite corners around an object, as a person clicks them."""
+    """Return two opposite corners around an object, as a person clicks them."""
     panel_object = panel().object(name)
     w, h = panel_object.face.half_width_m, panel_object.face.half_height_m
     x, y = panel_object.position_m
@@ -77,7 +77,7 @@ def test_one_click_finds_the_outline(
     face = panel().object(name).face
     w, h = face.half_width_m, face.half_height_m
     assert found.outline is not None and found.outline.shape == shape
-    assert np.allclose(found.size_m, (2 * w, 2 * h), atol=0.009)  # bezel or face: both are the gauge's
+    assert np.allclose(found.size_m, (2 * w, 2 * h), atol=0.009)  # the outline of the bezel or of the face
     assert np.allclose(overview.in_image([found.centre_m])[0], middle_of(view, name)[0], atol=8.0)
 
 
@@ -214,14 +214,14 @@ def test_a_panel_upside_down_is_refused(seen: tuple[np.ndarray, CameraProjection
 def test_a_panel_that_is_mirrored_is_refused(
     seen: tuple[np.ndarray, CameraProjection, Overview], askew: Callable[[np.ndarray], np.ndarray], words: str
 ) -> None:
-    """A mirrored gauge was read, surely and wrong, and what was there taught the kinds."""
+    """Otherwise a mirrored gauge would be read wrongly with high confidence, and its look would be taught."""
     image = np.ascontiguousarray(askew(seen[0]))
     with pytest.raises(NotFound, match=words):
         check_upright(image, one_plate(image, PLATE).view, panel())
 
 
 def test_a_second_example_takes_no_object_from_another_kind() -> None:
-    """Every kind gets a second example from a new image; on further images each object found before is found after."""
+    """Every kind gets a second example from a new image; in further images all objects found before are still found."""
     knowledge = load_knowledge()
     lesson_image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.66, pose_error=0.0, azimuth_deg=120.0)
     view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
@@ -240,7 +240,7 @@ def test_a_second_example_takes_no_object_from_another_kind() -> None:
                 plate_m=PLATE,
             )
         except Ambiguous:
-            continue  # it would have cost another kind: refused, which is the promise
+            continue  # refused because it would make another kind worse, as promised
         taught += lesson.added
         knowledge = lesson.knowledge
     assert taught >= 2 and NOTHING in {kind.name for kind in knowledge.kinds}
@@ -249,7 +249,7 @@ def test_a_second_example_takes_no_object_from_another_kind() -> None:
 
 
 def _found(image: np.ndarray, knowledge: object) -> set[str]:
-    """Names of the panel's objects that are found with their right kind."""
+    """Return the names of the panel's objects that are found with the right kind."""
     overview = overview_of(image, plate_m=PLATE)
     from perception.vision.teaching.lesson import check
 

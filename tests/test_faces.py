@@ -26,7 +26,7 @@ IMPORT = re.compile(r"from ([\w.]+) import (\([^)]*\)|[^\n]*)")
 
 
 def _used() -> Iterator[str]:
-    """Return the names that users import from packages, as `package.name`, including access by a dot."""
+    """Yield the names that users import from packages, as `package.name`, including access by a dot."""
     for folder, ending in (("service", "py"), ("examples", "py"), ("docs", "md")):
         for path in (ROOT / folder).rglob(f"*.{ending}"):
             text = path.read_text(encoding="utf-8")

@@ -32,7 +32,7 @@ class Block:
 
 
 def blocks() -> Iterator[Block]:
-    """Return the Python and shell blocks of all pages, in order."""
+    """Yield the Python and shell blocks of all pages, in order."""
     for page in PAGES:
         for found in _BLOCK.finditer(page.read_text(encoding="utf-8")):
             if found["language"] in RUNNABLE:

@@ -98,6 +98,6 @@ def wired(emulator: WireEmulator, driver: str, options: dict[str, Any] | None = 
 def wired_rig(
     emulator: WireEmulator, driver: str, options: dict[str, Any] | None = None, *, sample_period_s: float = 0.1
 ) -> Iterator[Rig[Any]]:
-    """Return a rig for the conformance tests."""
+    """Yield a rig for the conformance tests."""
     with wired(emulator, driver, options) as device:
         yield Rig(device=device, clock=CLOCK, sample_period_s=sample_period_s, inject=emulator.inject)

@@ -1,4 +1,4 @@
-"""A real browser for the tests of the web pages. Skipped where there is no Chromium."""
+"""Real browser for the tests of the web pages, which are skipped if there is no Chromium."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-PATIENCE_MS = 150_000  # a first click may compile, and a busy machine takes its time
+PATIENCE_MS = 150_000  # the first click may compile kernels, and the machine may be busy
 NEEDS_CHROMIUM = [
     pytest.mark.slow,
     pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium: apt-get install chromium"),
@@ -38,7 +38,7 @@ def browser() -> Iterator[Any]:
 
 
 def new_tab(browser: Any, *, height_px: int) -> tuple[Any, list[str]]:
-    """A tab, and the list of what goes wrong in its scripts or breaks the page's own policy."""
+    """Return a tab, and the list of script errors and violations of the page's content policy."""
     tab = browser.new_page(viewport={"width": 1400, "height": height_px})
     tab.set_default_timeout(PATIENCE_MS)
     faults: list[str] = []
@@ -48,5 +48,5 @@ def new_tab(browser: Any, *, height_px: int) -> tuple[Any, list[str]]:
 
 
 def until(page: Any, claim: str) -> None:
-    """Wait until a JavaScript claim holds; asked from outside, because the page's own policy forbids `eval`."""
+    """Wait until a JavaScript condition holds; evaluated from outside, because the page's policy forbids `eval`."""
     eventually(lambda: page.evaluate(f"() => Boolean({claim})"))

@@ -1,4 +1,4 @@
-"""A cell of fakes: real processes, real sockets, no physics."""
+"""Fixtures of a cell of fake devices: real processes and sockets, but no physics."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ WriteCell = Callable[..., Path]
 
 @pytest.fixture(autouse=True, scope="session")
 def _fakes_are_installed() -> Iterator[None]:
-    """Put the fakes where entry points are looked up, here and in child processes."""
+    """Register the fakes as entry points, here and in child processes."""
     before = os.environ.get("PYTHONPATH")
     paths = [str(FAKES), str(Path(__file__).parents[2]), *([before] if before else [])]
     os.environ["PYTHONPATH"] = os.pathsep.join(paths)
@@ -69,7 +69,7 @@ def _fakes_are_installed() -> Iterator[None]:
 
 @pytest.fixture
 def write_cell(tmp_path: Path) -> WriteCell:
-    """Writes a cell file of fakes: `write_cell(robot=True, options={"panel_lights": {...}}, mode="sim")`."""
+    """Return a function that writes a cell file of fakes, for example `write_cell(robot=True, mode="sim")`."""
     return lambda **given: _write(tmp_path, **given)
 
 
@@ -109,14 +109,14 @@ def _toml(value: object) -> str:
 
 @pytest.fixture(scope="module")
 def write_module_cell(tmp_path_factory: pytest.TempPathFactory) -> WriteCell:
-    """`write_cell` for fixtures that live as long as a test module."""
+    """Return `write_cell` for fixtures that live as long as a test module."""
     folder = tmp_path_factory.mktemp("cell")
     return lambda **given: _write(folder, **given)
 
 
 @pytest.fixture(scope="module")
 def served(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
-    """A whole panelwright over a cell of fakes with a robot, inline, on free ports, with the verbs of `verbs.py`."""
+    """Yield a complete panelwright, inline, on free ports: a cell of fakes, a robot and the verbs of `verbs.py`."""
     options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), inline=True)
     panelwright = Panelwright(load_cell(write_module_cell(robot=True)), options, operations=OPERATIONS)
     panelwright.start()
@@ -126,7 +126,7 @@ def served(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture
 def client(served: Panelwright) -> Iterator[httpx2.Client]:
-    """A client of `served`; everything is in order when a test begins."""
+    """Yield a client of `served`; everything works when a test begins."""
     with httpx2.Client(base_url=served.url, timeout=30.0, trust_env=False) as http:
         for task in http.get("/v1/tasks").json()["tasks"]:
             if task["state"] in ("queued", "running", "cancelling"):

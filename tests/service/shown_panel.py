@@ -1,4 +1,4 @@
-"""A cell of fakes before the panel that drawn images show: what tests of stored images, teaching and calibration share."""
+"""Cell of fakes in front of the panel of the drawn images, for tests of stored images, teaching and calibration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Shown = tuple[np.ndarray, CameraProjection]
 
 @pytest.fixture(scope="module")
 def house(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
-    """A cell of fakes before the panel that the images show, with the real verbs."""
+    """Yield a cell of fakes in front of the panel of the images, with the real verbs."""
     cell_path = write_module_cell(robot=True)
     text = TOML.replace('style = "lcd" }', 'style = "lcd", minimum = -99.0 }')
     (cell_path.parent / "panel.toml").write_text(text)

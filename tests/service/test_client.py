@@ -1,4 +1,4 @@
-"""The client of the HTTP API: what it makes of a broken, a foreign and no service, and stopping by it."""
+"""Tests of the client of the HTTP API: with a broken, a foreign and no service, and stopping by it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from service.processes.stop_host import InlineStop, bound_socket
 
 @pytest.fixture
 def hung() -> Iterator[tuple[socket.socket, socket.socket]]:
-    """Two neighbouring ports: one of a service that takes connections and never answers, the next one free."""
+    """Yield two neighbouring ports: one of a service that accepts connections and never answers, the next one free."""
     while True:
         service = bound_socket("127.0.0.1", 0)
         try:
@@ -65,7 +65,7 @@ def test_where_nobody_stops_a_person_must(hung: tuple[socket.socket, socket.sock
 
 
 class Interrupted:
-    """A client whose person presses Ctrl-C as soon as the task runs."""
+    """Client whose user presses Ctrl-C as soon as the task runs."""
 
     def __init__(self) -> None:
         self.posted: list[str] = []
@@ -87,7 +87,7 @@ def test_ctrl_c_ends_a_task_on_a_running_service_too(capsys: pytest.CaptureFixtu
 
 
 class Scripted(BaseHTTPRequestHandler):
-    """A service that breaks the event stream after the second event, and has ended the task when asked for the rest."""
+    """Service that breaks the event stream after the second event and ends the task before the rest is requested."""
 
     resumed_at: ClassVar[list[str]] = []
 
@@ -120,7 +120,7 @@ class Scripted(BaseHTTPRequestHandler):
         self.wfile.write(data)
 
     def log_message(self, *_args: object) -> None:
-        """Say nothing."""
+        """Do not log."""
 
 
 @pytest.fixture
@@ -150,7 +150,7 @@ def test_another_server_at_the_address_is_told_apart_from_none(scripted: Client)
     with pytest.raises(ConfigError, match="another program answers"):
         scripted.get("/v1/page")
     with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))  # bound, and nobody listens
+        unused.bind(("127.0.0.1", 0))  # bound without a listener
         with pytest.raises(
             DeviceUnavailable, match=r"no panelwright service answers at .*: Connection refused"
         ) as refusal:

@@ -1,4 +1,4 @@
-"""Stages run side by side, their end and their faults are told, and nothing is done twice."""
+"""Stages of compiling run in parallel, report their end and their faults, and nothing is done twice."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ else:
 
 @pytest.fixture
 def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of kernels, and workers that only write files there; `a` and `b` wait for each other."""
+    """Return a folder of kernels, with workers that only write files there; `a` and `b` wait for each other."""
     folder = tmp_path / "kernels"
     folder.mkdir()
     (tmp_path / "worker_of_test.py").write_text(WORKER.format(folder=str(folder), ending=kernel_cache.ENDINGS[0]))

@@ -1,4 +1,4 @@
-"""Things break in the middle of a real mission: the arm stops, the task says why, nothing stays behind."""
+"""If devices fail during a real mission, the arm stops, the task states the cause, and no process remains."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 class Bench:
-    """`panelwright serve` on the shipped cell, in processes of its own."""
+    """Run `panelwright serve` on the shipped cell, in separate processes."""
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as probe:
@@ -46,7 +46,7 @@ class Bench:
             return False
 
     def begin_mission(self) -> str:
-        """Start a mission; its URL, once the arm moves."""
+        """Start a mission; return its URL when the arm moves."""
         self.client.post("/v1/stop/reset")
         url = self.client.post("/v1/missions", json={}).headers["location"]
         eventually(lambda: self.task(url)["state"] == "running", timeout_s=120.0)

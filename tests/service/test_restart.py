@@ -1,4 +1,4 @@
-"""A service that starts again knows what the last one did, and takes nothing up by itself."""
+"""A restarted service knows what the last one did, and resumes nothing by itself."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_task_that_was_cut_off_is_aborted_and_not_taken_up(write_cell: WriteCe
     first = _service(cell, runs)
     task = first.submit("hold", HoldRequest())
     eventually(lambda: task.state is TaskState.RUNNING)
-    first.journal.close()  # as a power cut would: whatever comes after this is not recorded
+    first.journal.close()  # like a power failure: nothing is recorded after this
     first.close()
     second = _service(cell, runs)
     try:
@@ -87,7 +87,7 @@ def test_a_task_that_was_cut_off_is_aborted_and_not_taken_up(write_cell: WriteCe
 def test_a_second_service_on_the_same_folder_aborts_nothing_and_keeps_the_chain(
     write_cell: WriteCell, tmp_path: Path
 ) -> None:
-    """Somebody runs `panelwright demo` beside `panelwright serve`."""
+    """A user runs `panelwright demo` beside `panelwright serve`."""
     cell, runs = write_cell(robot=True), tmp_path / "runs"
     first = _service(cell, runs)
     task = first.submit("hold", HoldRequest())

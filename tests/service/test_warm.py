@@ -1,4 +1,4 @@
-"""Warming up runs the hot loops on something that they can really work on."""
+"""Warming up runs the hot loops on realistic data."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The mission with every device on its real protocol, through the real server: one seed a cell.
+"""Runs the mission with every device on its real protocol, through the real server: one seed per cell.
 
-The devices, their wires and their emulators are those of the shipped cell file. The panel before them is a small one, since
-on these wires time passes as it does on the wall: an instrument, a lamp, a valve, and a slider or a button. All seeds of the
-mission on the large panel: `python -m benchmarks.missions 1 5 --cell cells/wire-ur.toml`.
+The devices, links and emulators are those of the shipped cell file. The panel is small (an instrument, a lamp, a valve,
+and a slider or a button), because these cells run in real time. For the large panel and more seeds use
+`python -m benchmarks.missions 1 5 --cell cells/wire-ur.toml`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from service.client import Client
 from service.serve import Options, Panelwright
 
 ROOT = Path(__file__).parents[2]
-LONGEST_S = 500  # a busy machine compiles for a minute and lets time pass at half its pace
+LONGEST_S = 500  # a busy machine compiles for a minute and runs at half the speed
 pytestmark = [pytest.mark.wire, pytest.mark.timeout(LONGEST_S)]
 
 PANEL = """
@@ -86,7 +86,7 @@ lights_lamp = "run_lamp"
 
 
 def before_small_panel(folder: Path, cell: str, control: str) -> Path:
-    """The shipped cell file with another panel."""
+    """Return the shipped cell file with another panel."""
     text = (ROOT / f"cells/{cell}.toml").read_text()
     for path, mine in (
         ("panels/bench.toml", "panel.toml"),
@@ -102,7 +102,7 @@ def before_small_panel(folder: Path, cell: str, control: str) -> Path:
 
 
 def judged_mission(panelwright: Panelwright) -> tuple[list[str], str]:
-    """Run the mission and have it judged; what happened, and the mission's name."""
+    """Run and judge the mission; return the verdict and the mission's name."""
     client = Client(url=panelwright.url, timeout_s=LONGEST_S)
     stop = client.get("/v1/stop")
     assert stop["is_latched"], "a cell with real parts starts stopped"

@@ -1,4 +1,4 @@
-"""What the cell has found out so far."""
+"""Tests of the model of what the cell has found out so far."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting for what another process does, without a fixed pause."""
+"""Waits for results of other processes, without fixed pauses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def eventually(probe: Callable[[], T], *, timeout_s: float = 150.0) -> T:
-    """The first true answer of `probe`; fails when none comes in time. Missing files count as no answer."""
+    """Return the first true answer of `probe`; fail if none comes in time. Missing files count as no answer."""
     end_s = time.monotonic() + timeout_s
     pause = threading.Event()
     while True:

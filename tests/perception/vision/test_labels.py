@@ -30,7 +30,7 @@ def test_overlap_is_the_common_area() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_names_of_a_crowded_panel_do_not_overlap(seed: int) -> None:
-    """Return twenty small objects on a loose grid, whose labels are twice as wide as their distance."""
+    """The panel has twenty small objects on a loose grid, whose labels are twice as wide as their distance."""
     rng = np.random.default_rng(seed)
     grid = [(60 + 130 * i, 60 + 95 * j) for i in range(5) for j in range(4)]
     objects = [PixelBox(int(x + rng.integers(-25, 25)), int(y + rng.integers(-20, 20)), 30, 30) for x, y in grid]

@@ -1,4 +1,4 @@
-"""`panelwright calibrate board`: drawn photographs of boards, and files that are none."""
+"""Tests of `panelwright calibrate board` with drawn photographs of boards, and with other files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line as a person meets it: real processes, one clear message, no traceback, no orphan."""
+"""Tests of the command line as users run it: real processes, one clear message, no traceback, no orphan process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
 
 SCRIPT = Path(sys.executable).with_name("panelwright")
-"""What users type. Unlike `python -m` it does not put the current folder on the import path."""
+"""The command that users type; unlike `python -m` it does not put the current folder on the import path."""
 OURS = ("drivers", "fusion", "hal", "manipulation", "perception", "service", "simbackend")
 PANELWRIGHT = [sys.executable, "-m", "service.cli"]
 
@@ -131,7 +131,7 @@ def test_files_of_the_user_that_are_called_like_ours_break_nothing(write_cell: W
     command = [str(SCRIPT), "doctor", "--cell", str(write_cell(robot=True)), "--port", str(_free_port())]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "cell process" in done.stdout  # a child has started, and its driver was found
+    assert "cell process" in done.stdout  # a child process has started and has found its driver
 
 
 def test_init_copies_a_cell_that_doctor_accepts_and_never_overwrites(tmp_path: Path) -> None:
@@ -142,12 +142,12 @@ def test_init_copies_a_cell_that_doctor_accepts_and_never_overwrites(tmp_path: P
     (folder / "panels" / "bench.toml").write_text("name = 'other'")
     _assert_refused(_run("init", "mine", "--cell", "cells/ur10e.toml", cwd=tmp_path), "exists already")
     checked = _run("doctor", "--no-connect", "--cell", "cells/ur10e.toml", cwd=folder)
-    assert checked.returncode == 1  # it reads the copy, and not the shipped file
+    assert checked.returncode == 1  # the command reads the copy instead of the shipped file
     assert "panels/bench.toml" in checked.stdout
 
 
 class Served:
-    """`panelwright serve` in a process of its own."""
+    """Run `panelwright serve` in a separate process."""
 
     def __init__(self, cell: Path, folder: Path) -> None:
         with socket.socket() as probe:
@@ -176,7 +176,7 @@ class Served:
 
 @contextmanager
 def _hearing_hangups() -> Iterator[None]:
-    """Children inherit that SIGHUP is ignored, and it is where the tests themselves run under `nohup`."""
+    """Child processes inherit an ignored SIGHUP, for example if the tests themselves run under `nohup`."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
         yield
@@ -291,7 +291,7 @@ def test_a_task_that_never_looks_up_does_not_keep_the_service_alive(
 
 
 class OneAnswer:
-    """A client to whom every POST is answered by the same task."""
+    """Client for which every POST is answered by the same task."""
 
     def __init__(self, task: dict[str, Any]) -> None:
         self._task = task

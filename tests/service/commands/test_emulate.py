@@ -1,4 +1,4 @@
-"""`panelwright emulate`: which cell and device a name means, and what is printed for a driver."""
+"""Tests of `panelwright emulate`: which cell and device a name refers to, and what is printed for a driver."""
 
 from __future__ import annotations
 

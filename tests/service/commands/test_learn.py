@@ -1,4 +1,4 @@
-"""A panel that teaches itself: over HTTP from a stored image, from a file, and the looks that a cell file names."""
+"""Tests of learning from a known panel: over HTTP from a stored image, from a file, and the looks of a cell file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`panelwright range` and `panelwright batch range`: golden output on a scene with known truth, real files, bad input."""
+"""Tests of `panelwright range` and `panelwright batch range`: a scene with known truth, real files, bad input."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--scale", "1", *FOCAL), "median depth"),  # millimetres taken for metres
+        (("--scale", "1", *FOCAL), "median depth"),  # millimetres are taken for metres
         (("--scale", "-1"), "not positive"),
         (("--pitch", "0.001", *FOCAL), "either orthographic"),
         (("--centre", "3,4"), "without a focal length"),
@@ -183,11 +183,11 @@ def test_a_batch_goes_on_and_writes_a_line_a_recording_and_tells_of_the_bad_one(
 
 @pytest.mark.slow
 def test_ctrl_c_keeps_what_is_done_and_ends_calmly(tmp_path: Path) -> None:
-    """The terminal sends SIGINT to every process of the batch."""
+    """A terminal sends SIGINT to every process of the batch."""
     folder = tmp_path / "recordings"
     folder.mkdir()
     np.save(folder / "scan_0000.npy", DEPTH_M)
-    for k in range(1, 2000):  # too many to be done before the signal comes, however busy the machine is
+    for k in range(1, 2000):  # too many to be completed before the signal comes
         (folder / f"scan_{k:04d}.npy").hardlink_to(folder / "scan_0000.npy")
     out, part = tmp_path / "all.jsonl", tmp_path / "all.jsonl.part"
     words = [sys.executable, "-m", "service.cli", "batch", "range", folder, "--workers", "1", "--out", out, *FOCAL]

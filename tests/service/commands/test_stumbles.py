@@ -1,4 +1,4 @@
-"""What a person stumbled over at a terminal once: wrong folders, half addresses, logs, Ctrl-C before the start is over."""
+"""Tests of typical difficulties in a terminal: wrong folders, incomplete addresses, logs, Ctrl-C during the start."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_what_is_no_address_is_refused(url: str) -> None:
 
 
 class Stranger(BaseHTTPRequestHandler):
-    """Some other program's web page, and one that ends in the middle of its answer."""
+    """Web server of another program; one of its pages ends in the middle of the answer."""
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -87,7 +87,7 @@ class Stranger(BaseHTTPRequestHandler):
         self.wfile.write(b"<h1>hello</h1>")
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
+        """Do not log."""
 
 
 @pytest.fixture
@@ -197,7 +197,7 @@ def test_a_demo_that_is_broken_off_names_the_report_of_what_it_measured(tmp_path
     (tmp_path / "before" / "report.html").write_text("")
     before = demo.reports(tmp_path)
     (tmp_path / "now" / "report.html").write_text("")
-    os.utime(tmp_path / "now" / "report.html", (0.0, 0.0))  # the machine's clock was set back meanwhile
+    os.utime(tmp_path / "now" / "report.html", (0.0, 0.0))  # as if the machine's clock was set back meanwhile
     with demo.console.capture() as seen:
         demo._tell_what_is_left(tmp_path, before)
     assert str(tmp_path / "now") in seen.get()

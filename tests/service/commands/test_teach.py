@@ -57,7 +57,7 @@ def _talk(monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
 
 
 def _pixels(name: str, half_m: float = 0.0) -> str:
-    """Clicks on an object of the example: its middle, or two corners."""
+    """Return clicks on an object of the example: its centre, or two corners."""
     _, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0)
     view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
     steps = [[0.0, 0.0, 0.0]] if half_m == 0.0 else [[-half_m, half_m, 0.0], [half_m, -half_m, 0.0]]
@@ -109,6 +109,6 @@ def test_a_script_that_ends_too_early_or_never_makes_sense_writes_nothing(
     _talk(monkeypatch)
     with pytest.raises(InvalidRequest, match="there is no terminal"):
         teach(tmp_path / "panel.png", folder=tmp_path / "kinds")
-    with pytest.raises(InvalidRequest, match=r"pane\.png"):  # before it asks
+    with pytest.raises(InvalidRequest, match=r"pane\.png"):  # before it asks questions
         teach(tmp_path / "pane.png", folder=tmp_path / "kinds")
     assert not (tmp_path / "kinds").exists()

@@ -1,4 +1,4 @@
-"""A cell file with what cannot be meant is refused with all its faults at once, each with key, value and remedy."""
+"""An invalid cell file is refused with all its faults at once, each with key, value and remedy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Change = tuple[str, str]
 
 
 def changed(folder: Path, *changes: Change) -> Path:
-    """The bench's cell file with parts of its text replaced."""
+    """Return the bench's cell file with parts of its text replaced."""
     text = BENCH.replace("panels/", f"{ROOT}/panels/").replace("cells/", f"{ROOT}/cells/")
     for old, new in changes:
         assert old in text

@@ -1,4 +1,4 @@
-"""The conformance kit runs on any cell, and reports what it found and what it could not try."""
+"""The conformance tests run on any cell and report their results and what could not be tested."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def conform(path: Path, report: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, Any], str]:
-    """Run the command; its outcome and both reports."""
+    """Run the command; return its outcome and both reports."""
     command = ["conform", str(path), "--report", str(report), *arguments]
     done = subprocess.run(
         [sys.executable, "-m", "service.cli", *command], capture_output=True, text=True, timeout=240, check=False

@@ -1,4 +1,4 @@
-"""One device of a cell file read without a service: `panelwright devices read NAME --cell CELL`."""
+"""Tests of reading one device of a cell file without a service: `panelwright devices read NAME --cell CELL`."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def cell_with(port: str) -> Cell:
-    """The shipped mixed cell as a real one whose left finger sensor is on `port`."""
+    """Return the shipped mixed cell as a real one whose left finger sensor is on `port`."""
     cell = load_cell(ROOT / "cells" / "mixed.toml")
     devices = dict(cell.file.devices)
     section = devices["proximity_left"]

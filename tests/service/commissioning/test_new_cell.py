@@ -1,4 +1,4 @@
-"""A copied cell is whole, loads by itself, and never takes the place of anything."""
+"""A copied cell is complete, loads by itself, and never overwrites anything."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A device's wire is recorded and replayed by a user, and a running service's devices are watched."""
+"""Tests of recording and replaying the link of a device, and of watching the devices of a running service."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ options = { port = "PORT" }
 
 @pytest.fixture
 def wired_cell(write_cell: WriteCell) -> Any:
-    """A cell file with one device on a wire."""
+    """Yield a cell file with one device on a link."""
     far_side = tfmini.start(ScriptedProximity(), {})
     yield write_cell(mode="real", extra=WIRED.replace("PORT", far_side.address["port"]))
     far_side.close()
@@ -99,7 +99,7 @@ def test_a_file_that_is_no_recording_is_refused(text: str, tmp_path: Path) -> No
 
 
 class FakeService:
-    """Answers as the service does, for one device after the other."""
+    """Answers like the service, for one device after the other."""
 
     def __init__(self) -> None:
         self.samples, self.errors, self.asked = 100, 3, list[str]()

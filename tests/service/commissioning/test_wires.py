@@ -1,4 +1,4 @@
-"""Two devices of a cell that want one wire are told apart from those that share a bus, before anything is opened."""
+"""Two devices of a cell that claim one link are distinguished from those that share a bus before a port is opened."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Device = tuple[str, dict[str, Any]]
 
 def cell_of(*devices: Device, names: tuple[str, ...] = ("first", "second")) -> Cell:
     sections = {
-        name: DeviceSection(kind=DeviceKind.PROXIMITY, driver=driver, options=options)  # only driver and options count
+        name: DeviceSection(kind=DeviceKind.PROXIMITY, driver=driver, options=options)  # only driver and options matter
         for name, (driver, options) in zip(names, devices, strict=True)
     }
     return CELL.model_copy(update={"file": CELL.file.model_copy(update={"devices": sections})})
@@ -79,7 +79,7 @@ def test_one_wire_wanted_twice_is_refused_by_both_names(one: Device, other: Devi
         (("ur:rtde", {"host": "ur"}), ("ur:lights", {"host": "ur"})),
         (("udp:netft", {"host": "10.0.0.5", "port": 502}), ("modbus:touch", TCP)),
         (("sim:proximity", {}), ("sim:proximity", {})),
-        (("serial:tfmini", USB), ("serial:tfmini", {**USB, "baud": "fast"})),  # connecting says what is wrong
+        (("serial:tfmini", USB), ("serial:tfmini", {**USB, "baud": "fast"})),  # connecting reports the error
     ],
 )
 def test_a_bus_that_is_meant_to_be_shared_is(one: Device, other: Device) -> None:
@@ -94,7 +94,7 @@ def test_another_name_of_the_same_port_does_not_hide_it(tmp_path: Path) -> None:
 
 
 def test_an_isolated_device_shares_no_serial_bus() -> None:
-    """Its process opens the port for itself; a gateway takes several connections."""
+    """An isolated device's process opens the port itself; a gateway accepts several connections."""
     for wire, is_fine in ((USB, False), (TCP, True)):
         cell = cell_of(("modbus:ft300", wire), ("modbus:robotiq_2f", {**wire, "unit": 3, "baud": 19_200}))
         alone = cell.file.devices["first"].model_copy(update={"isolate": True})

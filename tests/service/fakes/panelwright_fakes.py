@@ -1,4 +1,4 @@
-"""Small devices without physics, reached by name like any driver. They answer at once and can be made to fail."""
+"""Fake devices without physics, found by name like any driver; they answer at once and can be made to fail."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 from hal.simulated import Fault
 
-# immortal: works on after `close`. trouble: a file that says `crash` or `away` for as long as it is there
+# immortal: continues to work after `close`. trouble: a file with `crash` or `away`, in effect while it exists
 OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal", "trouble"}
 
 
 class FakeDevice:
-    """Name, health, faults and stamps that all fakes share."""
+    """Base of all fakes: name, health, faults and stamps."""
 
     kind: DeviceKind
 
@@ -68,7 +68,7 @@ class FakeDevice:
 
     @staticmethod
     def _world(pid_file: str) -> subprocess.Popen[bytes]:
-        """A process of the device's own, as a simulator has; it would live for ever."""
+        """Start a process of the device, as a simulator does, that does not end by itself."""
         code = f"import os,threading; open({pid_file!r}, 'w').write(str(os.getpid())); threading.Event().wait()"
         return subprocess.Popen([sys.executable, "-c", code])
 
@@ -94,7 +94,7 @@ class FakeDevice:
     def _meet_trouble(self) -> None:
         kind = self._trouble.read_text() if self._trouble.exists() else ""
         if kind == "crash":
-            ctypes.string_at(0)  # a library in C that follows a bad pointer
+            ctypes.string_at(0)  # crashes like a C library with a bad pointer
         if kind == "away":
             raise DeviceUnavailable(f"{self.name} is not on its port", hint="plug it in", device=self.name)
 
@@ -105,7 +105,7 @@ class FakeDevice:
         if self._fault is Fault.SILENT:
             raise DeviceTimeout(f"{self.name} is silent", hint="check power and cable", device=self.name)
         if self._fault is Fault.FROZEN:
-            self._thawed.wait(60.0)  # hangs in spite of every deadline, as a bad SDK does
+            self._thawed.wait(60.0)  # ignores every deadline, as a bad SDK does
         self._sequence += 1
         return Stamped(value=value, host_time_s=self._clock.now_s(), sequence=self._sequence)
 

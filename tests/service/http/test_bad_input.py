@@ -1,4 +1,4 @@
-"""Bad input over HTTP: always a problem with a 4xx status, never a 5xx, never an echo, and nothing moves."""
+"""Bad input over HTTP always gets a problem with a 4xx status, never a 5xx or an echo, and nothing moves."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ CORPUS: dict[str, bytes] = {
 
 @pytest.fixture(autouse=True)
 def _nothing_moves(client: httpx2.Client, served: Panelwright) -> Iterator[None]:
-    """Before and after each test: same joints, no task that may move."""
+    """Check for each test that the joints have not moved and that no task may move."""
     mover = served.service.supervisor.connection.mover
     before = mover.state().position_rad.tolist()
     tasks = {task.id for task in served.service.tasks.all()}
@@ -136,7 +136,7 @@ def test_a_body_that_hides_its_length_is_cut_off(client: httpx2.Client) -> None:
 
 
 def _raw(served: Panelwright, request: bytes) -> bytes:
-    """What comes back until the server closes, or says nothing more for a while."""
+    """Return what is received until the server closes or is silent for a while."""
     answer = b""
     with socket.create_connection(("127.0.0.1", served.port), timeout=1.5) as link:
         link.sendall(request)
@@ -284,7 +284,7 @@ def test_a_mistyped_path_is_told_the_right_one(client: httpx2.Client, path: str,
 @given(body=st.binary(max_size=300))
 @settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_bytes_are_4xx(client: httpx2.Client, body: bytes) -> None:
-    """Random bytes are hardly ever a valid body; `{}` with spaces is, and reads nothing but the default."""
+    """Random bytes are hardly ever a valid body, except `{}` with spaces, which selects the defaults."""
     answer = client.post("/v1/measure", content=body, headers=JSON)
     assert answer.status_code < 500
     if body.strip() not in (b"{}", b""):
@@ -308,7 +308,7 @@ def test_any_json_is_never_5xx(client: httpx2.Client, path: str, body: dict[str,
 
 
 def test_the_api_document_keeps_its_word(client: httpx2.Client, served: Panelwright) -> None:
-    """Generated requests to every operation: no 5xx that is not declared, and every answer fits its schema."""
+    """Generated requests to every operation get no undeclared 5xx, and every answer fits its schema."""
     schema = schemathesis.openapi.from_dict(client.get("/openapi.json").json())
     schema.config.update(base_url=served.url)
     tried = 0
@@ -321,7 +321,7 @@ def test_the_api_document_keeps_its_word(client: httpx2.Client, served: Panelwri
         @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck), database=None)
         def check(case: schemathesis.Case) -> None:
             if case.query and "wait_s" in case.query:
-                case.query.pop("wait_s")  # waiting is what it would do, 30 s at a time
+                case.query.pop("wait_s")  # otherwise each request would wait for 30 s
             answer = case.call(headers={"Connection": "close"})
             assert answer.status_code < 500 or answer.status_code in (502, 503, 504), answer.text
             checks = [status_code_conformance, response_schema_conformance]
@@ -333,7 +333,7 @@ def test_the_api_document_keeps_its_word(client: httpx2.Client, served: Panelwri
 
 
 SKIPPED = {
-    "/v1/hold",  # would move: the corpus above covers bodies, this test what all the rest answers
+    "/v1/hold",  # would move; its bodies are covered by the tests above
     "/v1/wait",
     "/v1/tasks/{task_id}/events",  # a stream
 }

@@ -1,4 +1,4 @@
-"""The pages about the API say what the API does: every documented path exists, and every path is documented."""
+"""Every path in the pages about the API exists, and every path of the API is documented."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NOT_SHOWN = {"/v1/echo", "/v1/hold", "/v1/wait", "/v1/fail", "/v1/measure"}  # v
 
 
 def _documented() -> set[str]:
-    """Paths of the page about the API; "`POST /v1/a`, `/v1/b`" counts for both."""
+    """Return the paths in the page about the API; "`POST /v1/a`, `/v1/b`" counts for both."""
     text = PAGE.read_text(encoding="utf-8").replace("$TASK", "ID")
     found = re.findall(r"(?:localhost:846[01]|[` (])(/(?:v1/[\w{}./-]+|healthz|readyz|metrics))", text)
     return {path.rstrip(".").replace("/ID/", "/{task_id}/") for path in found}

@@ -1,4 +1,4 @@
-"""The HTTP front over a cell of fakes: a real server, a real socket, the whole way down to the devices."""
+"""Tests of the HTTP API with a cell of fakes: a real server and socket, all the way down to the devices."""
 
 from __future__ import annotations
 
@@ -329,7 +329,7 @@ def test_the_page_is_served_with_a_content_policy(client: httpx2.Client) -> None
 
 
 def test_a_device_that_hangs_holds_up_neither_stop_nor_tasks(client: httpx2.Client, served: Panelwright) -> None:
-    """More readers hang than there are threads for them; further ones are refused, everything else goes on."""
+    """If more readers hang than there are threads for them, further ones are refused, and everything else continues."""
     client.post("/v1/devices/wrist_camera/fault", json={"fault": "frozen"})
     limits = httpx2.Limits(max_connections=100)
     with (

@@ -1,4 +1,4 @@
-"""`/v1/knowledge`: an outline at a click, a new kind, a whole panel, and what is refused."""
+"""Tests of `/v1/knowledge`: an outline at a click, a new kind, a whole panel, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The web page in a real browser: it shows, starts, stops and resets. Skipped where there is no Chromium."""
+"""Tests of the web page in a real browser: display, start, stop and reset. Skipped if there is no Chromium."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = NEEDS_CHROMIUM
 
 @pytest.fixture(scope="module")
 def served_page(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
-    """A cell of fakes whose mission stands still for a long time."""
+    """Yield a cell of fakes whose mission stands still for a long time."""
     missions = Operation(
         name="missions", request_model=HoldRequest, result_model=HoldResult, run=hold, summary="Hold", moves=True
     )
@@ -61,7 +61,7 @@ def test_cell_devices_and_picture_show(page: Any) -> None:
 
 
 def test_the_tasks_can_be_read_on_a_telephone(page: Any, served_page: Panelwright) -> None:
-    """Why a task failed stood one letter a line."""
+    """The cause of a failed task must not be wrapped after each letter."""
     telephone = page.context.browser.new_page(viewport={"width": 400, "height": 800})
     telephone.goto(served_page.url)
     client = Client(url=served_page.url)
@@ -144,7 +144,7 @@ def test_stop_latches_visibly_and_only_a_reset_clears_it(page: Any, served_page:
 
 
 def test_no_reset_is_offered_while_a_stop_is_under_way(page: Any, served_page: Panelwright) -> None:
-    """A press stops on two ways; one that arrives after the reset would refuse it or latch again."""
+    """A press sends the stop in two ways; one that arrives after the reset would refuse it or latch again."""
     held: list[Any] = []
     page.route(lambda url: url == served_page.stop_url, lambda route: held.append(route))  # noqa: PLW0108 - it needs a function of Python
     page.click("#stop")
@@ -166,8 +166,8 @@ def test_the_stop_works_before_the_page_knows_anything(page: Any, served_page: P
     until(tab, "document.querySelector('#stop-box').dataset.latched === 'yes'")
     assert served_page.service.supervisor.latch.is_set()
     tab.unroute_all()
-    until(tab, "document.querySelector('#cell-line').textContent.includes('cell fake')")  # asked again and again
-    tab.click("#reset:not([hidden])")  # not before both ways of the stop have ended
+    until(tab, "document.querySelector('#cell-line').textContent.includes('cell fake')")  # the page repeats its request
+    tab.click("#reset:not([hidden])")  # only after both stop requests have ended
     until(tab, "document.querySelector('#stop-box').dataset.latched === 'no'")
     assert not served_page.service.supervisor.latch.is_set()
     tab.close()
@@ -196,7 +196,7 @@ def test_an_unreachable_service_is_said_and_nothing_old_passes_for_new(page: Any
 
 
 def test_a_stop_of_a_service_that_was_started_anew_is_no_old_news(page: Any, served_page: Panelwright) -> None:
-    """It counts its stops from the beginning, and the machine's clock may have been set back meanwhile."""
+    """A restarted service counts its stops from the beginning, and the machine's clock may have been set back."""
     fresh = {"is_latched": False, "count": 0, "changed_time_s": time.time() - 3600.0, "source": "anew", "stop_url": ""}
     served_page.service.supervisor.stop("a test")
     until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")

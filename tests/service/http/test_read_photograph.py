@@ -1,4 +1,4 @@
-"""`POST /v1/read-photograph` and `panelwright read`: the same answer, refusals with a hint, errors as problems."""
+"""`POST /v1/read-photograph` and `panelwright read` give the same answer, refusals with a hint, errors as problems."""
 
 from __future__ import annotations
 

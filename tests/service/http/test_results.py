@@ -1,4 +1,4 @@
-"""Every verb says in the API document what it answers, and the answers fit what it says."""
+"""Every verb declares its answer in the API document, and the answers fit the declaration."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RESULTS = {
 
 
 def of(name: str) -> dict[str, Any]:
-    """A schema of the document that stands by itself."""
+    """Return a schema of the document as a self-contained schema."""
     return {"$ref": f"#/components/schemas/{name}", "components": {"schemas": SCHEMAS}}
 
 
@@ -73,7 +73,7 @@ def _used_by(name: str, seen: frozenset[str] = frozenset()) -> set[str]:
 
 @pytest.mark.parametrize("body", [NINE_KINDS, ROUND_POST])
 def test_a_fused_answer_fits_its_schema(body: dict[str, Any]) -> None:
-    session: Any = None  # given measurements need no cell
+    session: Any = None  # measurements in the request need no cell
     answer = run_fuse(session, FuseRequest.model_validate_json(json.dumps(body)))
     jsonschema_rs.validate(of("FuseResult"), json.loads(json.dumps(jsonable(answer))))
 

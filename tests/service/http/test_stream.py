@@ -1,4 +1,4 @@
-"""The WebSocket stream: many samples a second, encoded once for all, and no listener holds another up."""
+"""The WebSocket stream sends many samples per second, encoded once for all, and no listener delays another."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_stop_shows_in_the_stream(socket: ClientConnection, client: httpx2.Cli
 
 
 def test_an_arm_that_falls_silent_shows_in_the_stream(socket: ClientConnection, client: httpx2.Client) -> None:
-    """Its last joints were shown as if they were new."""
+    """The last joint state must not be shown as if it were new."""
     assert _next(socket)["faults"] == []
     client.post("/v1/devices/arm/fault", json={"fault": "silent"})
     eventually(lambda: _next(socket)["faults"] == ["arm: timeout"])
@@ -77,7 +77,7 @@ def test_what_a_listener_says_is_ignored(socket: ClientConnection) -> None:
 
 
 def test_watching_does_not_disturb_a_motion(socket: ClientConnection, client: httpx2.Client) -> None:
-    """A state read and a motion exclude each other in the controller; a watcher must never cost a motion."""
+    """State reads and motions exclude each other in the controller; a watcher must never make a motion fail."""
     for _ in range(5):
         assert client.post("/v1/hold?wait_s=20", json={"seconds": 0.4}).json()["state"] == "succeeded"
         _next(socket)

@@ -1,4 +1,4 @@
-"""The teach page in a real browser: upload, click, see the outline, name, save, check. Skipped without Chromium."""
+"""Tests of the teach page in a real browser: upload, click, outline, name, save, check. Skipped without Chromium."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = NEEDS_CHROMIUM
 
 @pytest.fixture
 def page(browser: Any, house: Panelwright, shown: Shown, tmp_path: Path) -> Iterator[Any]:
-    """The page with an image uploaded; every test has a page of its own, so that none begins with another's clicks."""
+    """Yield the page with an uploaded image; every test has its own page, without the clicks of other tests."""
     file = tmp_path / "panel.png"
     cv2.imwrite(str(file), shown[0])
     tab, faults = new_tab(browser, height_px=1100)
@@ -36,15 +36,15 @@ def page(browser: Any, house: Panelwright, shown: Shown, tmp_path: Path) -> Iter
 
 
 def _click(page: Any, shown: Shown, *places_m: tuple[float, float]) -> None:
-    """Click on points of the plate, as far as the page shows them."""
+    """Click on points of the plate that are visible in the page."""
     picture = page.locator("#picture")
     for u, v in shown[1].project([[x, y, 0.0] for x, y in places_m]):
         scale = picture.bounding_box()["width"] / shown[0].shape[1]
-        picture.click(position={"x": (u + 0.5) * scale, "y": (v + 0.5) * scale})  # once it no longer moves
+        picture.click(position={"x": (u + 0.5) * scale, "y": (v + 0.5) * scale})  # when it no longer moves
 
 
 def _outlined(page: Any, button: str) -> None:
-    """Wait for the answer to the clicks: it must be an outline, and then the button works."""
+    """Wait for the answer to the clicks, which must be an outline that enables the button."""
     until(page, "!document.querySelector('#found').textContent.startsWith('Looking')")
     assert page.is_enabled(button), page.text_content("#found")
 
@@ -152,7 +152,7 @@ def test_a_known_panel_teaches_its_looks_from_the_image(page: Any, house: Panelw
 
 
 def test_a_drive_there_that_finds_no_panel_is_explained_and_a_latched_stop_forbids_it(page: Any) -> None:
-    """The cell of fakes sees no lights."""
+    """The camera of the fakes shows no lights."""
     page.click("#mode-looks")
     page.click("#learn-here:not([disabled])")
     page.wait_for_selector("#complaint:not([hidden])")
@@ -176,7 +176,7 @@ def test_what_is_typed_stays_when_the_questions_of_another_kind_come_late(page: 
     page.select_option("#object-kind", "display")
     until(page, "document.querySelector('#object-kind').value === 'display'")
     page.fill("[data-key=name]", "level")
-    eventually(lambda: page.title() and held)  # asking lets the events of the browser in
+    eventually(lambda: page.title() and held)  # reading the title lets events of the browser be processed
     held[0].continue_()
     until(page, "!document.querySelector('[data-key=at_min]')")
     assert page.input_value("[data-key=name]") == "level"

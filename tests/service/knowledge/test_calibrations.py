@@ -1,4 +1,4 @@
-"""Calibration records of a cell: over those of the cell file, older ones kept, listed and refused over HTTP."""
+"""Tests of a cell's calibration records: they replace those of the cell file, old ones are kept, listed or refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stored images over HTTP: what is uploaded is checked, kept, read blind and taught; bad ones are typed refusals."""
+"""Tests of stored images over HTTP: uploads are checked, kept, read blind and taught; bad ones are refused."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_blind_recognition_draws_what_it_finds(web: httpx2.Client, shown: Shown)
 
 
 def _bare(image: np.ndarray, view: CameraProjection) -> np.ndarray:
-    """The image with the emergency mushroom painted over with plate."""
+    """Return the image with the emergency mushroom painted over by plate."""
     u, v = np.rint(view.project([panel().object("emergency").point_m])[0]).astype(int)
     out = image.copy()
     out[v - 60 : v + 60, u - 60 : u + 60] = np.median(image[v - 70 : v - 60, u - 70 : u + 70])

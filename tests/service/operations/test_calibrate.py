@@ -1,4 +1,4 @@
-"""Calibrating on the simulated cell, inline, as the verb does it; the truth is the simulator's, asked for afterwards."""
+"""Tests of calibration on the simulated cell, inline, as the verb does it, compared with the simulator's truth."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 @dataclass(kw_only=True)
 class Rig:
-    """An inline cell; `session()` is a new task on it."""
+    """Inline cell; `session()` begins a new task on it."""
 
     runtime: CellRuntime
     runs: Path
@@ -57,7 +57,7 @@ class Rig:
 
 
 def hurried(cell: Cell) -> Cell:
-    """The same cell with fewer control ticks to a station: most of the time here goes into driving."""
+    """Return the same cell with fewer control ticks per pose, because most of the time is spent on driving."""
     file = cell.file
     return cell.model_copy(
         update={
@@ -79,7 +79,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 
 def off_by(rig: Rig, device: str, path: str) -> tuple[float, float]:
-    """Error of a written mount against the truth that the seed drew: m and degrees."""
+    """Return the error of a written mount, compared with the truth of the seed, in m and degrees."""
     built = rig.cell.calibration_of(device).mount
     found = load_calibration(Path(path)).mount
     assert built is not None and found is not None
@@ -119,7 +119,7 @@ def test_the_tool_is_weighed_and_the_bias_found(rig: Rig) -> None:
     assert found is not None and built is not None
     truth = Draws(SEED).load("wrist_ft", built.load())
     assert abs(found.mass_kg - truth.mass_kg) < 0.02
-    assert np.linalg.norm(np.subtract(found.bias_force_n, truth.bias[:3])) < 0.5  # its own drift is 0.15 N an axis
+    assert np.linalg.norm(np.subtract(found.bias_force_n, truth.bias[:3])) < 0.5  # the drift is 0.15 N per axis
     assert result.in_use_from == "the next start of the service"
 
 

@@ -1,4 +1,4 @@
-"""Mushroom and wheel by their surfaces, held against layout and vision."""
+"""Tests of comparing mushroom and wheel, found by their surfaces, with layout and vision."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SIGMA_M = 0.001
 
 
 def pose(parent_from_child: RigidTransform, sigma_m: float) -> UncertainPose:
-    """Well known but for its place."""
+    """Return a pose with a precise orientation and `sigma_m` in position."""
     return UncertainPose(parent_from_child=parent_from_child, covariance=np.diag([sigma_m**2] * 3 + [1e-10] * 3))
 
 
 def sighting(
     panel_object: Mushroom | Handwheel, *, off_m: tuple[float, float] = (0.0, 0.0), state: float = 0.0
 ) -> Sighting:
-    """An object seen `off_m` (x, y on the panel) beside its place in the file."""
+    """Return an object found `off_m` (x, y on the panel) from its place in the file."""
     at = RigidTransform.from_translation(
         [panel_object.position_m[0] + off_m[0], panel_object.position_m[1] + off_m[1], 0.0]
     )
@@ -51,7 +51,7 @@ def sighting(
 def reading(
     panel_object: Mushroom | Handwheel, *, state: str | None = None, value: float | None = None
 ) -> ObjectReading:
-    """What vision says, from where the file has the object."""
+    """Return a reading by vision, with the object at its place in the file."""
     return ObjectReading(
         name=panel_object.name,
         kind=panel_object.kind,
@@ -66,7 +66,7 @@ def reading(
 
 
 def check(seen: Sighting, shown: ObjectReading | None = None, place: str = OVERVIEW) -> SurfaceCheck:
-    """The judgement with a panel pose that is known to a tenth of a millimetre."""
+    """Return the judgement with a panel pose that is known to 0.1 mm."""
     return compared(seen, pose(BASE_FROM_PANEL, 1e-4), 0.0002, shown, place)
 
 
@@ -81,7 +81,7 @@ def test_the_distance_is_told_with_its_deviation_and_that_from_vision():
 
 @pytest.mark.parametrize(("sigmas", "stands_elsewhere"), [(3.6, False), (3.8, True)])
 def test_one_of_a_thousand_that_stand_in_their_place_is_taken_to_stand_elsewhere(sigmas, stands_elsewhere):
-    # On two degrees of freedom a deviation r has p = exp(-r^2 / 2): a thousandth at 3.717.
+    # With two degrees of freedom a deviation r has p = exp(-r^2 / 2), which is 0.001 at 3.717.
     off_m = sigmas * np.sqrt(SIGMA_M**2 + 1e-8 + 4e-8)
     row = check(sighting(WHEEL, off_m=(0.6 * off_m, 0.8 * off_m)))
     assert row.stands_elsewhere is stands_elsewhere

@@ -1,4 +1,4 @@
-"""The judge believes nothing: a false claim of any kind shows."""
+"""The judge verifies everything, so a false claim of any kind is detected."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_what_moved_though_nobody_asked_is_told() -> None:
 
 
 def test_of_several_deeds_with_one_control_the_last_is_judged() -> None:
-    """On, and off again: the lamp is dark, and both claims were true when they were made."""
+    """After on and off again the lamp is dark, but both claims were true when they were made."""
     deeds = [action("start", "on"), action("start", "off")]
     looks = [reading("run_lamp", AFTER, state="on"), reading("run_lamp", AFTER, state="off")]
     verdict = compare(report(actions=deeds, readings=looks), truth(lamp="off"), PANEL)
@@ -144,7 +144,7 @@ def test_a_mission_without_a_report_is_refused_before_anything_is_asked(tmp_path
 
 @pytest.mark.parametrize(("key", "other"), [("cell", "press"), ("panel", "press"), ("seed", 8)])
 def test_a_mission_of_another_cell_is_not_judged_by_this_simulator(tmp_path: Path, key: str, other: str | int) -> None:
-    """Of another panel it was a KeyError, of another seed a verdict about the wrong world."""
+    """Otherwise another panel would raise KeyError, and another seed would be judged by the wrong world."""
     ran = {"cell": "bench", "panel": "bench", "seed": 7, key: other}
     (tmp_path / "report.json").write_text(json.dumps(report(**ran)))
     cell = SimpleNamespace(name="bench", panel=PANEL, file=SimpleNamespace(cell=SimpleNamespace(seed=7)))
@@ -155,7 +155,7 @@ def test_a_mission_of_another_cell_is_not_judged_by_this_simulator(tmp_path: Pat
 def test_a_mission_is_compared_with_what_its_own_beginning_showed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second mission of a service was compared with the beginning of the world: what the first had moved was blamed on it."""
+    """A second mission is not compared with the beginning of the world, since the first one has changed it."""
     asked: list[float] = []
 
     def told(initial_s: float = 0.0) -> Truth:

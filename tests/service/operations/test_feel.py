@@ -1,4 +1,4 @@
-"""Touching the plate: the place that tells most comes first, one that cannot be touched is replaced, a stop ends it."""
+"""Tests of touching the plate: the most informative place is first, unreachable ones are replaced, a stop ends it."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SPOTS_M = np.array([(0.25, 0.16), (-0.25, -0.16), (0.12, -0.2), (-0.12, 0.2), (0
 
 
 def touch_at(spot_m: Any) -> ErrorBudget:
-    """What a touch of 0.2 mm tells; in this test the base's axes are the panel's and its origin."""
+    """Return the information of a touch with 0.2 mm; in these tests the base frame equals the panel frame."""
     row = np.array([0.0, 0.0, 1.0, spot_m[1], -spot_m[0], 0.0]) / 2e-4
     return ErrorBudget(information=np.outer(row, row), own=np.outer(row, row), shared={})
 
 
 def plan(**changes: Any) -> TouchPlan:
-    """What a touch tells is known to 1 mm and 3 mrad, the rest ten times better."""
+    """Return a pose known to 1 mm and 3 mrad where touches are informative, and ten times better otherwise."""
     A = np.diag(np.array([1e-4, 1e-4, 1e-3, 3e-3, 3e-3, 3e-4]) ** -2.0)
     made = TouchPlan(
         base_from_panel=BASE_FROM_PANEL,
@@ -44,7 +44,7 @@ def plan(**changes: Any) -> TouchPlan:
 
 
 class Toucher:
-    """Stands for the arm: the first touches fail with the errors given; the others return their place."""
+    """Replaces the arm: the first touches raise the given errors; the others return their place."""
 
     def __init__(self, *errors: Exception) -> None:
         self.errors = list(errors)

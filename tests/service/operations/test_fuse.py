@@ -1,4 +1,4 @@
-"""The verb `fuse` with measurements that are given: nine kinds, proofs, and objects with unknown measures."""
+"""Tests of the verb `fuse` with measurements in the request: nine kinds, proofs, and objects of unknown dimensions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.schema.fuse_request import FuseRequest
 
 
 def fused(body: dict[str, Any]) -> dict[str, Any]:
-    """What a client gets; measurements that are given need no cell."""
+    """Return the answer that a client gets; measurements in the request need no cell."""
     request = FuseRequest.model_validate_json(json.dumps(body))
     answer: dict[str, Any] = json.loads(json.dumps(jsonable(run_fuse(None, request))))
     return answer
@@ -63,7 +63,7 @@ def test_a_radius_and_a_length_come_back_with_their_sigma() -> None:
 
 
 def test_any_feature_set_with_parameters_is_estimated() -> None:
-    """Two plates a gap apart, the second one's place unknown: touches on both give pose and gap."""
+    """Two plates with an unknown gap between them: touches on both give pose and gap."""
     gap_m, spread = 0.085, 0.1
     places = [(x, y) for x in (-spread, 0.0, spread) for y in (-spread, spread)]
     variance = (4e-8 * np.eye(3)).tolist()
@@ -85,7 +85,7 @@ def test_any_feature_set_with_parameters_is_estimated() -> None:
     shape = {"kind": "features", "parameters": [{"name": "gap", "start_m": 0.1}], "parts": parts}
     answer = fused({"measurements": touches, "prior": PRIOR, "shape": shape})
     assert answer["shape"]["values"] == pytest.approx([gap_m], abs=1e-5)
-    # 6 touches on each plate: the gap is known to sigma sqrt(1/6 + 1/6) when the tilt is shared.
+    # With 6 touches on each plate and a common tilt, the sigma of the gap is sigma sqrt(1/6 + 1/6).
     assert answer["shape"]["sigma"][0] == pytest.approx(2e-4 * np.sqrt(1 / 3), rel=0.02)
 
 
@@ -124,7 +124,7 @@ def test_an_unknown_part_is_refused_by_name() -> None:
 
 
 def edge_and_touches(rng: np.random.Generator, *, per_m2: float) -> dict[str, Any]:
-    """Nine touches of 0.2 mm on three faces of a corner; variances in 1 / `per_m2` of m^2."""
+    """Return nine touches of 0.2 mm on three faces of a corner; variances are in units of 1 / `per_m2` m^2."""
     faces = [(axis, place) for axis in range(3) for place in (0.1, 0.3, 0.5)]
     touches = []
     for axis, place in faces:

@@ -1,4 +1,4 @@
-"""The simulated cell and its own panel, inline: blind with the shipped looks, after one lesson, and as it is shipped."""
+"""Tests of blind recognition of the simulated cell's panel: with the shipped looks, after a lesson, and as shipped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a cable hides from straight ahead is read from the side, on the simulated cell."""
+"""On the simulated cell, what a cable hides from straight ahead is read from the side."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ CABLE = CableSection(path_m=((0.06, 0.3, 0.05), (0.098, 0.118, 0.03), (0.16, 0.0
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    """Before the located panel, seed 3, a cable before its display."""
+    """Yield a session with the panel of seed 3 located and a cable in front of its display."""
     cell = with_cables(load_cell(ROOT / "cells/bench.toml", seed=3), CABLE)
     with open_session(cell, tmp_path_factory.mktemp("look-past")) as session:
         yield session
 
 
 def truth_of(session: Session, name: str) -> Any:
-    """What the object truly shows."""
+    """Return the true text, state or value of the object."""
     arm = session.connection.device("arm")
     return next(panel_object for panel_object in arm.truth().objects if panel_object.name == name)
 
 
 def straight_look(session: Session) -> Inspection:
-    """From straight ahead, by one who has never read the display: the last number would decide between two."""
+    """Look from straight ahead without memory of the display, because the last number would decide between two."""
     session.world.forget_reading("temperature")
     return inspect.look_close(session, session.panel.object("temperature").point_m, ("temperature",))
 
@@ -73,7 +73,7 @@ def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypa
 
 
 def test_a_cap_that_looks_alike_from_afar_is_read_from_close_by(session: Session) -> None:
-    """A black cap in a black ring: four sides at 0.34 m told nothing, for 5 s."""
+    """Views from four sides at 0.34 m do not help with a black cap in a black ring, and would take 5 s."""
     straight = close_ups(session, ("hold",))
     assert not straight.readings["hold"].answered
     found = inspect.look_past(session, straight)
@@ -85,7 +85,7 @@ def test_a_cap_that_looks_alike_from_afar_is_read_from_close_by(session: Session
 def test_a_cap_that_no_side_shows_says_how_often_it_was_looked_at(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewpoints, "CLOSE_SIDES", ("the left", "above"))  # from further off this one looks alike
+    monkeypatch.setattr(viewpoints, "CLOSE_SIDES", ("the left", "above"))  # from a distance this object is ambiguous
     session.world.forget_reading("hold")
     reading = inspect_close(session, ("hold",)).readings["hold"]
     assert not reading.answered and "(2 views from the sides did not help)" in (reading.reason or "")
@@ -115,7 +115,7 @@ def test_a_guess_is_answered_to_who_asks_for_it_and_not_remembered(
 
 
 def test_a_camera_that_froze_on_the_way_is_named_by_the_first_close_up(session: Session) -> None:
-    """Its first frame is no repetition yet: it shows the panel as from before, and the panel's pose was blamed."""
+    """The first frozen frame is not a repetition yet; it shows the old view, so the panel's pose could be blamed."""
     camera = session.connection.device("wrist_camera")
     inspect.go_to_overview(session)
     camera.inject_fault(Fault.FROZEN)

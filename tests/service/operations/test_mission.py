@@ -1,4 +1,4 @@
-"""The whole mission on the simulated cell, inline: what it does, that it repeats, and that no truth reaches it."""
+"""Tests of the mission on the simulated cell, inline: its actions, reproducibility, and no access to the truth."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 @contextmanager
 def mission_context(folder: Path, seed: int, *, misplaced_m: float = 0.0) -> Iterator[OperationContext]:
-    """An inline cell with a task of its own; the wheel is built `misplaced_m` beside where the panel file has it."""
+    """Yield an inline cell with a task; the wheel is built `misplaced_m` from its place in the panel file."""
     cell = load_cell(ROOT / "cells/bench.toml", seed=seed)
     runtime = CellRuntime.start(cell, is_latched=lambda: False)
     if misplaced_m:
@@ -56,20 +56,20 @@ def mission_context(folder: Path, seed: int, *, misplaced_m: float = 0.0) -> Ite
 
 
 def report_of(folder: Path) -> dict[str, Any]:
-    """The only report below a folder."""
+    """Return the only report below a folder."""
     (path,) = folder.glob("runs/*/report.json")
     report: dict[str, Any] = json.loads(path.read_text())
     return report
 
 
 def without_wall_time(report: dict[str, Any]) -> dict[str, Any]:
-    """What must repeat: everything but names and times of the wall."""
+    """Return the reproducible part: everything except names and wall-clock times."""
     kept = {key: value for key, value in report.items() if key not in ("mission", "started", "wall_s", "judge")}
     return {**kept, "steps": [{**step, "wall_s": 0.0} for step in report["steps"]]}
 
 
 def lie(truth: Truth) -> Truth:
-    """A truth in which everything is elsewhere and shows something else."""
+    """Return a truth in which everything has another place and state."""
     matrix = truth.base_from_panel_matrix.copy()
     matrix[:3, 3] += (0.05, -0.04, 0.03)
     wrong = tuple(
@@ -79,7 +79,7 @@ def lie(truth: Truth) -> Truth:
 
 
 def stand_close(session: Session) -> None:
-    """Drive to where a deed ends: the second look at a control."""
+    """Drive to where an action ends, at the close-up of a control."""
     go_to_overview(session)
     locate(session)
     look_close(session, session.panel.object("setpoint").point_m, ("setpoint",))
@@ -131,7 +131,7 @@ def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_
 def test_a_device_that_dies_ends_the_mission_by_name_and_nothing_is_lost(tmp_path: Path, device: str) -> None:
     with mission_context(tmp_path, seed=4) as context:
         if device == "range_scanner":
-            stand_close(Session(context=context))  # as after a deed: the mission gets away from there
+            stand_close(Session(context=context))  # as after an action; the mission must be able to leave this pose
         context.connection.device(device).inject_fault(Fault.DISCONNECTED)
         with pytest.raises(CellError) as caught:
             run_mission(context, MissionRequest())
@@ -145,7 +145,7 @@ def test_a_device_that_dies_ends_the_mission_by_name_and_nothing_is_lost(tmp_pat
 
 
 def test_an_arm_that_does_not_follow_is_left_where_it_stands(tmp_path: Path) -> None:
-    """Parking it began with a leap of 20 mm, and 102 N at the wrist."""
+    """Otherwise parking would begin with a jump of 20 mm and 102 N at the wrist."""
     with mission_context(tmp_path, seed=4) as context:
         mover = context.connection.mover
         execute, reports = mover.execute, []
@@ -154,7 +154,7 @@ def test_an_arm_that_does_not_follow_is_left_where_it_stands(tmp_path: Path) -> 
             reports.append(execute(motion))
             return reports[-1]
 
-        mover.execute = noted  # type: ignore[method-assign]  # every motion, of the mission and after it
+        mover.execute = noted  # type: ignore[method-assign]  # records every motion of the mission and after it
         context.connection.device("arm").inject_fault(Fault.FROZEN)
         with pytest.raises(DeviceFault, match="does not follow"):
             run_mission(context, MissionRequest())
@@ -172,7 +172,7 @@ def test_an_arm_that_stands_at_the_panel_and_knows_of_none_gets_away(tmp_path: P
         stand_close(session)
         session.world.forget()  # as after a restart of the service
         home = np.array(session.cell.file.workspace.park_rad)
-        assert not go_to_joints(session, home, name="home")  # nothing can be planned from in there
+        assert not go_to_joints(session, home, name="home")  # no path can be planned from this pose
         go_to_overview(session)
 
 

@@ -1,4 +1,4 @@
-"""The mushroom and the valve wheel of a panel file found by their surfaces in a drawn range image."""
+"""Tests of finding the mushroom and the valve wheel of a panel file by their surfaces in a drawn range image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WHEEL = Handwheel(name="bypass", position_m=(-0.06, -0.02))
 
 
 def panel() -> Panel:
-    """A plate with the two, and a button that is not looked for."""
+    """Return a plate with both objects, and a button that is not searched for."""
     lights = tuple(
         Light(name=f"l{k}", position_m=(x, y, 0.0005))
         for k, (x, y) in enumerate([(-0.28, 0.2), (0.28, 0.2), (0.28, -0.2), (-0.28, -0.2)])
@@ -48,12 +48,12 @@ def panel() -> Panel:
 
 
 def certain(pose: RigidTransform) -> UncertainPose:
-    """A pose without errors."""
+    """Return a pose without errors."""
     return UncertainPose(parent_from_child=pose, covariance=np.zeros((6, 6)))
 
 
 def drawn(panel_from_thing: RigidTransform, panel_object: Mushroom | Handwheel) -> np.ndarray:
-    """Depth of one object by itself."""
+    """Return the depth of one object by itself."""
     model = models_of(panel())[panel_object.name]
     sen = np.array([1.0, FOCAL_PX, FOCAL_PX, (SIDE - 1) / 2, (SIDE - 1) / 2])
     pose = SCANNER_FROM_PANEL * panel_from_thing
@@ -65,7 +65,7 @@ def drawn(panel_from_thing: RigidTransform, panel_object: Mushroom | Handwheel) 
 
 
 def plate_depth(height_m: float = 0.0) -> np.ndarray:
-    """Depth of a plane at a height above the plate."""
+    """Return the depth of a plane at a height above the plate."""
     v, u = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
     rays = np.stack([u / FOCAL_PX, v / FOCAL_PX, np.ones((SIDE, SIDE))], axis=-1)
     R, p = SCANNER_FROM_PANEL.rotation.as_matrix(), SCANNER_FROM_PANEL.apply([0.0, 0.0, height_m])
@@ -73,18 +73,18 @@ def plate_depth(height_m: float = 0.0) -> np.ndarray:
 
 
 def standing(panel_object: Mushroom | Handwheel, turn_rad: float = 0.0) -> RigidTransform:
-    """Pose of an object at its place in the panel file, turned counter-clockwise."""
+    """Return the pose of an object at its place in the panel file, rotated counter-clockwise."""
     return RigidTransform.from_components([*panel_object.position_m, 0.0], Rotation.from_euler("z", turn_rad))
 
 
 def scan_of(depth: np.ndarray, *, seed: int = 3, projection: str = "pinhole") -> Scan:
-    """A scan with 0.6 mm of noise in which half of the beams at a jump report anything between its two sides."""
+    """Return a scan with 0.6 mm noise; half of the beams at a jump report a random depth between its two sides."""
     rng = np.random.default_rng(seed)
     near, far = (change(depth, np.ones((3, 3))) for change in (cv2.erode, cv2.dilate))
     is_mixed = (far - near > JUMP_M) & (rng.random(depth.shape) < 0.5)
     depth = np.where(is_mixed, near + rng.random(depth.shape) * (far - near), depth)
     c = RangeScannerCapabilities(
-        projection=projection,  # any text is tried
+        projection=projection,  # tests use any text
         width=SIDE,
         height=SIDE,
         fx=FOCAL_PX,
@@ -108,7 +108,7 @@ def scan_of(depth: np.ndarray, *, seed: int = 3, projection: str = "pinhole") ->
 def sightings(
     scan: Scan, believed: RigidTransform = SCANNER_FROM_PANEL, *, sigma_m: float = 0.0
 ) -> dict[str, Sighting]:
-    """What is found in a scan, by name."""
+    """Return what is found in a scan, by name."""
     scene = surfaces_in(scan)
     pose = UncertainPose(parent_from_child=believed, covariance=np.diag([sigma_m**2] * 3 + [0.0] * 3))
     found = find_by_surfaces(scene, scan, panel(), pose, scene.largest_plane())

@@ -1,4 +1,4 @@
-"""What a reading tells the skills."""
+"""Tests of how a reading is passed to the skills."""
 
 from __future__ import annotations
 

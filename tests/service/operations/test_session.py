@@ -1,4 +1,4 @@
-"""What a motion that failed is called: the device that failed, or what was in the way of the arm."""
+"""The error of a failed motion names the failed device or what was in the arm's way."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.operations.session import Session
 
 
 def failure(outcome: MotionOutcome, cause: str, **more: str) -> CellError:
-    """What `run` raises for a motion that ended so."""
+    """Return the error that `run` raises for a motion with this outcome."""
     report = SimpleNamespace(name="to park", outcome=outcome, cause=cause, device=None, tripped=None)
     vars(report).update(more)
     mover: Any = SimpleNamespace(execute=lambda _: report)

@@ -1,4 +1,4 @@
-"""A line scanner is swept by the wrist, and gives what a range camera gives from the same pose."""
+"""A line scanner swept by the wrist gives the same result as a range camera at the same pose."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def bench(seed: int, **options: Any) -> Cell:
-    """The bench cell with further options of its range scanner."""
+    """Return the bench cell with further options of its range scanner."""
     cell = load_cell(ROOT / "cells/bench.toml", seed=seed)
     section = cell.file.devices["range_scanner"]
     devices = {
@@ -41,7 +41,7 @@ def bench(seed: int, **options: Any) -> Cell:
 
 @contextmanager
 def session_of(cell: Cell, folder: Path) -> Iterator[Session]:
-    """A task of its own on an inline cell."""
+    """Yield a session with its own task on an inline cell."""
     runtime = CellRuntime.start(cell, is_latched=lambda: False)
     try:
         yield Session(
@@ -57,7 +57,7 @@ def session_of(cell: Cell, folder: Path) -> Iterator[Session]:
 
 
 def seen_from_the_overview(session: Session) -> tuple[ScannedPlane, list[Sighting]]:
-    """The plate's plane, and the mushroom and the wheel, from the overview."""
+    """Return the plate's plane, the mushroom and the wheel, measured from the overview."""
     go_to_overview(session)
     located = locate(session)
     image = scan(session)
@@ -67,7 +67,7 @@ def seen_from_the_overview(session: Session) -> tuple[ScannedPlane, list[Sightin
 
 
 def sigma_between(plane: ScannedPlane, session: Session) -> tuple[float, float]:
-    """One sigma, m and rad, of a plane seen by a scanner: its fit's, and its mount's, which each sweep meets anew."""
+    """Return the sigma, m and rad, of a scanned plane, from the fit and the mount."""
     fit, mount = plane.fit.feature, session.mount("range_scanner").covariance
     offset = fit.direction @ fit.point_covariance @ fit.direction + fit.direction @ mount[:3, :3] @ fit.direction
     return float(np.sqrt(offset)), float(np.sqrt(np.trace(fit.direction_covariance) + mount[3, 3]))

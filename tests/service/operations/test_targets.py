@@ -1,4 +1,4 @@
-"""A request that makes no sense is refused before anything moves."""
+"""An invalid request is refused before anything moves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driving to the first of several poses: quick searches for all of them before a long one for any."""
+"""Before driving to one of several poses, quick searches are tried for all poses before a long one for any."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ pytestmark = pytest.mark.timeout(300)
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    """Before the located panel."""
+    """Yield a session with the panel located."""
     with open_session(load_cell(ROOT / "cells/bench.toml", seed=3), tmp_path_factory.mktemp("travel")) as session:
         yield session
 
 
 def efforts_of(session: Session, monkeypatch: pytest.MonkeyPatch, *, found_at: int) -> list[Effort]:
-    """The efforts of all searches when the one of that number finds a way; the arm drives it."""
+    """Return the efforts of all searches if search number `found_at` finds a path, which the arm drives."""
     asked: list[Effort] = []
     transfer = SkillContext.transfer
 
@@ -48,7 +48,7 @@ def efforts_of(session: Session, monkeypatch: pytest.MonkeyPatch, *, found_at: i
 
 
 def test_views_near_by_go_before_those_of_another_branch_of_the_arm() -> None:
-    """One look took 3.9 s of turning over where the same from a camera on its side takes 1.4 s."""
+    """A view for which the arm must flip takes 3.9 s; the same view with the camera on its side takes 1.4 s."""
     here = np.zeros(6)
     asked = []
 

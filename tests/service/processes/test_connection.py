@@ -1,4 +1,4 @@
-"""The service's hold on a cell in another process: a proxy a thread, and none that outlives its thread."""
+"""The service's connection to a cell process has one proxy per thread, and none outlives its thread."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CELL = load_cell(Path(__file__).parents[3] / "cells" / "bench.toml")
 
 
 class Wire:
-    """What a proxy is here: something that can be closed."""
+    """Replacement of a proxy that can only be closed."""
 
     is_open = True
 

@@ -1,4 +1,4 @@
-"""`isolate = true`: the driver lives in a process of its own, and the cell does not notice until that process dies."""
+"""With `isolate = true` the driver runs in its own process, which makes no difference until that process dies."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_a_driver_that_crashes_says_so_and_is_started_again_until_it_is_closed(
     eventually(lambda: "SIGSEGV" in device.health().detail)
     with pytest.raises(DeviceUnavailable, match=r"fake:proximity, has crashed \(SIGSEGV\)"):
         read(device)
-    trouble.write_text("away")  # as of a device that was unplugged: not a crash, tried for ever
+    trouble.write_text("away")  # like an unplugged device: not a crash, so it is retried without limit
     eventually(lambda: "not on its port" in device.health().detail)
     trouble.unlink()
     eventually(lambda: device.health().connected)

@@ -1,4 +1,4 @@
-"""The stop latch: it starts latched, damage means latched, and only a reset that saw the newest stop clears it."""
+"""The stop latch starts latched, is latched if damaged, and is cleared only by a reset that saw the newest stop."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_writer_that_died_in_the_middle_reads_as_latched(tmp_path: Path) -> No
     latch = Latch.create(path)
     latch.reset("test", seen_count=latch.state().count)
     torn = bytearray(path.read_bytes())
-    torn[0] |= 1  # an odd sequence: the record was being written
+    torn[0] |= 1  # an odd sequence means that the record was being written
     path.write_bytes(bytes(torn))
     assert Latch(path).state().is_latched
 
@@ -107,7 +107,7 @@ def test_readers_never_see_a_mixed_record(tmp_path: Path) -> None:
 
 
 class LatchLife(RuleBasedStateMachine):
-    """Stops and resets in any order, against the obvious model."""
+    """Stops and resets in any order, compared with a simple model."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -207,7 +207,7 @@ def test_the_supervisors_lines_stop_and_reset(tmp_path: Path) -> None:
 
 
 def test_slow_and_broken_clients_hold_nobody_up(tmp_path: Path) -> None:
-    """Half-open connections by the hundred, and a stop is still answered."""
+    """A stop is still answered with hundreds of half-open connections."""
     import socket
 
     latch = Latch.create(tmp_path / "latch")

@@ -1,4 +1,4 @@
-"""A cell is served without the devices that do not connect: what works is offered, and the rest is connected later."""
+"""A cell is served without the devices that do not connect; the others work, and the rest is connected later."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ AWAY = "away"
 
 @pytest.fixture
 def trouble(tmp_path: Path) -> Path:
-    """A file that says what is wrong with the devices that look at it."""
+    """Return a file that states the fault of the devices that read it."""
     file = tmp_path / "trouble"
     file.write_text(AWAY)
     return file
@@ -32,7 +32,7 @@ def trouble(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def serve(write_cell: WriteCell, trouble: Path, tmp_path: Path) -> Iterator[Serve]:
-    """Serves a cell of fakes in which the given devices are away."""
+    """Yield a function that serves a cell of fakes in which the given devices are absent."""
     opened: list[Any] = []
 
     def serve(*away: str, inline: bool = True) -> httpx2.Client:

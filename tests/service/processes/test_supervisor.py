@@ -1,4 +1,4 @@
-"""The processes of a cell: they start together, they die together, and the latch outlives them all."""
+"""The processes of a cell start and end together, and the latch outlives them."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_a_cell_that_keeps_dying_stays_down_after_three_restarts(write_cell: Wri
 
 
 def eventually_raises(supervisor: Supervisor) -> None:
-    """Read until the connection notices that the cell is down."""
+    """Read until the connection detects that the cell is down."""
 
     def read() -> bool:
         try:

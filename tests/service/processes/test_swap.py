@@ -1,4 +1,4 @@
-"""Another driver for a device while the cell runs: over HTTP, in a real cell process, with emulated wires."""
+"""Tests of changing a device's driver while the cell runs: over HTTP, in a real cell process, with emulators."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SOON = Deadline.after(WallClock(), 3600.0)
 
 @pytest.fixture(scope="module")
 def sensors(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
-    """Sensors in a cell process of their own."""
+    """Yield a service with sensors in a separate cell process."""
     options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), warm=False)
     panelwright = Panelwright(load_cell(write_module_cell(mode="real")), options, operations=OPERATIONS)
     panelwright.start()
@@ -46,7 +46,7 @@ def sensors(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture
 def http(sensors: Panelwright) -> Iterator[httpx2.Client]:
-    """A client; each test begins with the fakes in their places."""
+    """Yield a client; each test begins with the fakes as drivers."""
     with httpx2.Client(base_url=sensors.url, timeout=30.0, trust_env=False) as http:
         for name, kind in (("finger_proximity", "proximity"), ("panel_lights", "lights")):
             assert http.put(f"/v1/devices/{name}", json={"driver": f"fake:{kind}"}).status_code == 200
@@ -55,7 +55,7 @@ def http(sensors: Panelwright) -> Iterator[httpx2.Client]:
 
 @pytest.fixture
 def far_side() -> Iterator[Any]:
-    """A TFmini on a pseudo terminal."""
+    """Yield an emulated TFmini on a pseudo terminal."""
     emulator = tfmini.start(ScriptedProximity(fixed_m=0.456), {})
     yield emulator
     emulator.close()
@@ -127,7 +127,7 @@ def test_the_old_device_is_kept_when_the_new_one_does_not_connect(
 
 @pytest.fixture
 def recordings(sensors: Panelwright, http: httpx2.Client) -> Iterator[Path]:
-    """The folder of recordings, with a film of two frames; the fake camera is back in its place afterwards."""
+    """Yield the folder of recordings, with a video of two frames; afterwards the fake camera is restored."""
     folder = sensors.service.runs_dir / "recordings"
     (folder / "film").mkdir(parents=True, exist_ok=True)
     for number in range(2):
@@ -225,7 +225,7 @@ def test_many_swaps_leave_no_descriptor_and_no_thread(http: httpx2.Client, senso
     for _ in range(10):
         swap_twice()
     after = (cell.num_fds(), cell.num_threads(), own.num_fds())
-    spare = 12  # six threads of the service, a connection each, may not have met the newest device yet
+    spare = 12  # six threads of the service may not have connected to the newest device yet
     assert all(b <= a + spare for a, b in zip(before, after, strict=True)), (before, after)
 
 
@@ -246,7 +246,7 @@ def test_the_swapped_device_is_there_again_after_a_restart_of_the_cell_process(
 
 @pytest.fixture(scope="module")
 def robot(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
-    """A cell with an arm, inline."""
+    """Yield an inline cell with an arm."""
     options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), inline=True, warm=False)
     panelwright = Panelwright(load_cell(write_module_cell(robot=True, mode="real")), options, operations=OPERATIONS)
     panelwright.start()

@@ -1,4 +1,4 @@
-"""What a stop, its reset and a take-over are worth that come while the arm stands, between two motions of a task."""
+"""A stop, its reset and a take-over take effect although the arm stands between two motions of a task."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATIENCE_S = 20.0
 
 
 class Thinker:
-    """An operation that moves, thinks until it may go on, and moves again."""
+    """Operation that moves, waits until it may continue, and moves again."""
 
     def __init__(self) -> None:
         self.thinks, self.may_go_on = threading.Event(), threading.Event()
@@ -67,7 +67,7 @@ def stop_and_reset(service: Service) -> None:
 
 
 def refused(task: Task) -> str:
-    """What a task that has failed says."""
+    """Return the problem of a failed task."""
     assert task.wait(PATIENCE_S)
     assert task.state is TaskState.FAILED and task.problem is not None
     assert task.problem["type"] == "urn:panelwright:stopped"
@@ -112,7 +112,7 @@ def test_a_take_over_at_the_very_moment_of_a_command_wins(service: Service) -> N
 
 
 def kinds(service: Service) -> list[tuple[str, str]]:
-    """The stops and resets in the journal, with what they came from."""
+    """Return the stops and resets in the journal, with their sources."""
     return [(r.kind, r.data["source"]) for r in service.journal.records(kinds=("stop", "stop-reset"))]
 
 

@@ -1,4 +1,4 @@
-"""A task without the right to move begins no motion, and does not zero the wrench either."""
+"""A task without the right to move can neither begin a motion nor zero the wrench."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.tasks.gate import GatedMover
 
 
 class Counting:
-    """A mover that counts what reaches it."""
+    """Mover that counts its calls."""
 
     def __init__(self, failed: str | None = None) -> None:
         self.asked: list[str] = []

@@ -1,4 +1,4 @@
-"""The journal: acknowledged means on disk, the chain shows every change, a killed writer loses nothing acknowledged."""
+"""Acknowledged rows of the journal are on disk, even if the writer is killed; the hash chain reveals every change."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_who_reads_while_it_is_divided_misses_nothing(tmp_path: Path) -> None:
 
 
 def test_rows_that_could_only_be_copied_are_told_once_and_written_on(tmp_path: Path) -> None:
-    """As after a crash between the copy and the deletion."""
+    """Set up the state after a crash between the copy and the deletion."""
     journal = Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=100)
     with sqlite3.connect(tmp_path / "j.sqlite") as db:
         db.execute("CREATE TRIGGER full BEFORE DELETE ON journal BEGIN SELECT RAISE(ABORT, 'disk full'); END")

@@ -1,4 +1,4 @@
-"""The lease: one holder, a rising epoch, and nobody moves on an old one."""
+"""The lease has one holder and a rising epoch, and no motion is allowed with an old epoch."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_tokens_with_odd_letters_are_refused_not_crashed_on() -> None:
 
 
 class LeaseLife(RuleBasedStateMachine):
-    """Any order of calls and silences, against a model of who holds it until when."""
+    """Calls and pauses in any order, compared with a model of who holds the lease until when."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The life of tasks: only allowed transitions, one motion at a time, cancel stops the arm first, nothing is lost."""
+"""Tasks make only allowed transitions, one may move at a time, cancel stops the arm first, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ S = TaskState
 
 
 class Recorder:
-    """Keeps what was recorded; refuses when told to."""
+    """Stores the records, and refuses them when told to."""
 
     def __init__(self) -> None:
         self.records: list[tuple[str, dict[str, Any]]] = []
@@ -109,7 +109,7 @@ def test_cancel_stops_the_arm_first_and_goes_on_until_the_task_ends(bench: Bench
         while not context.is_cancelled:
             threading.Event().wait(0.001)
         seen.append(bench.stops)
-        eventually(lambda: bench.stops >= 3)  # a cancel that falls between two motions must meet the second
+        eventually(lambda: bench.stops >= 3)  # a cancel between two motions must stop the second one
         context.check_cancelled()
 
     task = bench.store.start("test", {}, move, moves=True)

@@ -1,4 +1,4 @@
-"""Fusion of measurements to a pose: nine sensing classes, one squared distance, one robust pose (paper IV).
+"""Fuses measurements of nine sensing classes into one robust pose (paper, section IV).
 
     from fusion import fuse, features, sensing
     touched = sensing.touch(features.plane((0.4, 0.2, 0), (0, 0, 1)), base_from_finger, sigma_m=0.0003)

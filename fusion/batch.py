@@ -14,11 +14,11 @@ from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose
 
-GATE_PROBABILITY = 0.999  # a good measurement passes its gate with this probability (notes/fusion.md, "Robust")
+GATE_PROBABILITY = 0.999  # a good measurement passes its gate with this probability
 GATES = np.array([np.inf, *(2.0 * gammaincinv(0.5 * np.arange(1, 7), GATE_PROBABILITY))])  # quantiles of chi-square
-FAR_M = 100.0  # no panel is this far away, so such a number is in millimetres
-WIDE_M = 10.0  # no sensor has such a large standard deviation
-SHARP_M = 1e-9  # and none such a small one
+FAR_M = 100.0  # no panel is this far away, so a larger number must be in millimetres
+WIDE_M = 10.0  # no sensor has a larger standard deviation
+SHARP_M = 1e-9  # no sensor has a smaller standard deviation
 SHARP_RAD = 1e-9
 _DOF = np.array([[6] * 4] + [[constraints_of(c, rank) for rank in range(4)] for c in range(1, 10)])
 _FIELDS: tuple[tuple[str, tuple[int, ...]], ...] = (
@@ -36,13 +36,20 @@ _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 class Batch(NamedTuple):
     """Measurements as arrays; symmetric matrices as (xx, xy, xz, yy, yz, zz).
 
-    cls, dof: (N,) integers; m, w: (N, 3) object point and direction; mu: (N, 3); C: (N, 6) covariance; variance, axes:
-    (N, 3), (N, 3, 3) its eigenvalues, rising, and unit eigenvectors as rows; d, a1, a2: (N, 3) unit eigenvectors of M,
-    its null direction first; p: (N, 2) information of the other two, 1/rad^2, 0 where it is rounding error; tilt: (N,
-    3) all eigenvalues unchanged (a null one of 1e-4 is rounding error, but it is part of f); gate: (N,) chi-square
-    limits; prior_*: pose (3, 3), (3,), and whitening (6, 6) such that |W delta|^2 is chi-square.
+    A prior pose is an additional last entry with cls 0.
 
-    A prior pose is one more entry with cls 0 at the end.
+    Attributes:
+        cls, dof: (N,) class and degrees of freedom.
+        m, w: (N, 3) point and direction of the object feature.
+        mu: (N, 3) sensed point.
+        C: (N, 6) covariance of mu.
+        variance, axes: (N, 3) eigenvalues of C in rising order, and (N, 3, 3) unit eigenvectors as rows.
+        d, a1, a2: (N, 3) unit eigenvectors of M, its null direction first.
+        p: (N, 2) information along a1 and a2, 1/rad^2; 0 where it is only rounding error.
+        tilt: (N, 3) all eigenvalues of M unchanged, because even a rounding error of the null one is part of f.
+        gate: (N,) chi-square limits.
+        prior_r, prior_t: (3, 3), (3,) prior pose.
+        prior_w: (6, 6) whitening W of the prior pose, such that |W delta|^2 is chi-square.
     """
 
     cls: NDArray[np.int64]
@@ -131,7 +138,7 @@ def _stacked(measurements: Sequence[Measurement], name: str, shape: tuple[int, .
     """Return one field of all measurements, (N + extra, *shape); zero for the prior.
 
     Raises:
-        InvalidRequest: one has another shape.
+        InvalidRequest: the field of a measurement has another shape.
     """
     given = [getattr(m, name) for m in measurements]
     try:

@@ -110,10 +110,7 @@ def measurement(
 
 
 def constraints_of(cls: int, rank: int) -> int:
-    """Return the number of constraints of a class when `rank` of the two direction errors are known.
-
-    Source: notes/fusion.md, table.
-    """
+    """Return the number of constraints of a class when `rank` of the two direction errors are known."""
     rank = min(rank, 2)
     return {1: 3, 2: 2, 3: 1, 4: rank, 5: 2 + rank, 6: 1 + max(rank - 1, 0), 7: max(rank - 1, 0), 8: rank, 9: 1 + rank}[
         cls

@@ -21,8 +21,8 @@ from hal.arrays import Array
 from hal.errors import InvalidRequest
 from hal.geometry import matrix_of, skew
 
-LEAST_GAIN = 0.01  # of the pose's mean square error: a touch that is expected to bring less is not made
-TOUCH_S = 2.0  # hovering, approaching and leaving, without the way there
+LEAST_GAIN = 0.01  # of the pose's mean square error; a touch with a smaller expected gain is not made
+TOUCH_S = 2.0  # duration of hovering, approaching and leaving, without the motion between places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,17 +109,17 @@ def next_measurement(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TouchPlan:
-    """What is known of the pose, and the places that could be touched next.
+    """The present information about the pose, and the places that could be touched next.
 
     Attributes:
-        base_from_panel: the pose believed.
-        budget: of all observations so far.
-        tolerance: how well the pose is wanted.
-        spots_m: (N, 2) places left, panel frame, those that are farthest apart first.
-        offers: what a touch at each of them would tell.
-        places: how many of the first ones may be chosen; the others replace those that cannot be touched.
-        tip_m: (2,) where the fingertips are, panel frame.
-        speed_m_per_s: of the tips on the way.
+        base_from_panel: estimated pose.
+        budget: error budget of all observations so far.
+        tolerance: wanted accuracy of the pose.
+        spots_m: (N, 2) remaining places, panel frame, those that are farthest apart first.
+        offers: expected error budget of a touch at each of them.
+        places: the first so many places may be chosen; the others replace those that cannot be touched.
+        tip_m: (2,) position of the fingertips, panel frame.
+        speed_m_per_s: speed of the tips between places.
     """
 
     base_from_panel: RigidTransform
@@ -154,7 +154,7 @@ class TouchPlan:
         return replace(self, spots_m=self.spots_m[left], offers=tuple(self.offers[k] for k in left))
 
     def after(self, index: int, told: ErrorBudget) -> Self:
-        """Return the plan after a place was touched and its readings told so much."""
+        """Return the plan after a place was touched, with `told` the error budget of its readings."""
         budget, tip_m = self.budget.plus(told), self.spots_m[index]
         return replace(self.without(index), budget=budget, places=self.places - 1, tip_m=tip_m)
 

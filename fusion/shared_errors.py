@@ -1,9 +1,9 @@
 """Covariance of a pose whose measurements share the errors of their sensors' mountings.
 
-All readings of one sensor share the error of its mounting, and all rays of one camera that of its lens. In the weights,
-each measurement carries the error of the mounting as if it were its own. The covariance of the pose is then summed over
-the errors that are really independent. An error of one sigma changes the whitened residuals r by dr, and so moves the
-estimate by A^-1 g with g = J^T dr and A = J^T J (linear error propagation):
+All readings of one sensor share the error of its mounting, and all rays of one camera share that of its lens. For the
+weights, each measurement contains the error of the mounting as if it were independent. The covariance of the pose is
+then summed over the errors that are really independent. An error of one sigma changes the whitened residuals r by dr,
+and so moves the estimate by A^-1 g with g = J^T dr and A = J^T J (linear error propagation):
 
     covariance = A^-1 (sum_k g_k g_k^T) A^-1
 """

@@ -1,4 +1,4 @@
-"""Compiles, or loads from the cache, the kernels of control and planning, so that the first plan is not slower."""
+"""Compiles the kernels of control and planning, or loads them from the cache, so that the first plan is not slower."""
 
 from __future__ import annotations
 

@@ -21,9 +21,9 @@ from hal.arrays import Array
 from hal.geometry import skew
 
 GAUSS_NEWTON_STEPS = 20
-STILL = 1e-22  # of the predicted fall, as a share of the error's scale
+STILL = 1e-22  # the descent stops when the predicted decrease is a smaller share of the error's scale
 BARRIER_STEPS = 25
-SLACK = 1e-6  # how far the proven bound may lie below the value, as a share of 1 + value
+SLACK = 1e-6  # largest difference between the value and the proven bound, as a share of 1 + value
 POSITIVE = 1e-9  # least eigenvalue of the scaled S that counts as positive
 
 
@@ -47,9 +47,14 @@ class Minimiser:
 class _Identity:
     """The constraints at z = (1, vec I, 0, 0).
 
-    tangent (16, 6): dz of a step (translation, rotation); across (16, 15): basis perpendicular to z; normals (16, 29):
-    A_k z; normal_fit (29, 16): multipliers from Q z; restricted (29, 15, 15): the constraints across z; free (K, 15,
-    15): their combinations that vanish at z.
+    Attributes:
+        z: (16,) the identity pose.
+        tangent: (16, 6) derivative of z by a step (translation, rotation).
+        across: (16, 15) basis perpendicular to z.
+        normals: (16, 29) A_k z.
+        normal_fit: (29, 16) gives multipliers from Q z.
+        restricted: (29, 15, 15) the constraints across z.
+        free: (K, 15, 15) combinations of the constraints that vanish at z.
     """
 
     z: Array

@@ -1,6 +1,6 @@
 """The error at frozen covariances as one quadratic form over z = (1, vec R, t, -R^T t), compiled.
 
-See notes/fusion.md, "Certificate". With s = -R^T t the rows of `fusion.distance.rows` are linear in z,
+With s = -R^T t the rows of `fusion.distance.rows` are linear in z,
 
     A = a^T m - a^T s - a^T R^T mu      B = n^T (R m + t - mu)      D = n^T R w.
 """

@@ -1,4 +1,4 @@
-"""Proof that no other pose fits better, by semidefinite relaxation (notes/fusion.md, "Certificate").
+"""Proof that no other pose fits better, by semidefinite relaxation.
 
 At frozen covariances E = z^T Q z with z = (1, vec R, t, -R^T t), 16 numbers, for any mixture of the nine classes and
 any number of measurements (`lifted`). Shor's relaxation replaces z z^T by a positive semidefinite Z under 29 quadratic

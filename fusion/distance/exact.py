@@ -1,7 +1,7 @@
-"""The nine local pose functions without approximation, and their gradients, compiled (paper eq 10; notes/fusion.md).
+"""The nine local pose functions without approximation, and their gradients, compiled (paper eq 10).
 
-Classes 1, 2, 3, 5, 6 and 9 have closed forms. In 4, 7 and 8 the sensed point and direction are coupled, and there
-remains
+Classes 1, 2, 3, 5, 6 and 9 have closed forms. In classes 4, 7 and 8 the sensed point and direction are coupled, and f is
+the minimum over the directions v of
 
     F(v) = F0 + s (h.v)^2 / (v.A v) + v.M v,    |v| = 1
 
@@ -21,11 +21,11 @@ from fusion.vectors import Vec, across, blend, cross, dot, normalised, turned, v
 from hal.arrays import Array
 from hal.jit import compiled, inlined
 
-# A symmetric matrix by its eigenvalues and unit eigenvectors, so that v.S v is a sum of squares without cancellation.
+# A symmetric matrix as eigenvalues and unit eigenvectors, so that v.S v is a sum of squares without cancellation.
 Spectral = tuple[float, float, float, Vec, Vec, Vec]
-REFINED = 8  # starts that Newton's method follows, best first
-LONGEST = 0.7  # step on the sphere, rad (as a tangent)
-CIRCLE = 24  # starts on the half circle of plane-line
+REFINED = 8  # number of starts that Newton's method refines, best first
+LONGEST = 0.7  # largest step on the sphere, rad (as a tangent)
+CIRCLE = 24  # number of starts on the half circle of plane-line
 
 # Half of the 26 neighbours of a cube's centre: any direction is within 23 degrees of one of them or its opposite.
 _GRID = np.array([

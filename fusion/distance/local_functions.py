@@ -1,8 +1,7 @@
-"""The exact nine local pose functions: how badly a pose fits each measurement (paper eqs 10-13, Fig. 12).
+"""Computes the exact local pose functions of measurements at a pose (paper eqs 10-13, Fig. 12).
 
-`f(X) = min over Y of g(Y)` under the class's constraint. The formulas are in notes/fusion.md, table of section 2; the
-compiled code is in `exact`, a slow independent one in `reference`. At the true pose f follows a chi-square distribution
-with `Measurement.dof`.
+`f(X) = min over Y of g(Y)` under the constraint of the class. The compiled code is in `exact`. At the true pose f has a
+chi-square distribution with `Measurement.dof` degrees of freedom.
 """
 
 from __future__ import annotations

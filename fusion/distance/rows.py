@@ -1,4 +1,4 @@
-"""Whitened residual rows of the nine classes, compiled (notes/fusion.md, "Residual rows").
+"""Whitened residual rows of the nine classes, compiled.
 
 With e = R m + t - mu, the three kinds of row and their derivatives over (translation, rotation) are
 

@@ -23,15 +23,15 @@ from fusion.solve.observability import FreeDirection
 from hal.arrays import Array
 from hal.geometry import UncertainPose
 
-EVIDENCE_NEEDED = math.log(1000.0)  # of agreement against chance, if a measurement was rejected
-EVIDENCE_PER_MISMATCH = 0.5  # for each rejected measurement, because bad ones are less frequent than good ones
+EVIDENCE_NEEDED = math.log(1000.0)  # least log odds of agreement against chance, if a measurement was rejected
+EVIDENCE_PER_MISMATCH = 0.5  # added per rejected measurement, because bad ones are less frequent than good ones
 ONE_IN = 1e5
 NO_NOISE = 1e-9  # a chi-square per degree of freedom too small for any sensor's noise, in any unit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proofs:
-    """The proofs wanted beside the pose: the certificate, and the best set within so many seconds (None: no proof)."""
+    """The wanted proofs: the certificate, and the best set within `set_within_s` seconds (None for no proof)."""
 
     certificate: bool = False
     set_within_s: float | None = None

@@ -1,11 +1,11 @@
-"""The best set of measurements, proven by branch and bound over the inlier sets (notes/fusion.md, "Robust").
+"""The best set of measurements, proven by branch and bound over the inlier sets.
 
 The truncated error sum min(E_i, gate_i) of N measurements is the least, over all 2^N sets I, of
 
     min over poses of sum_{i in I} E_i  +  sum_{i not in I} gate_i.
 
 A node of the tree has decided some measurements: I are inliers, O outliers. Whatever is decided for the rest, the error
-there is at least min sum_I E_i + sum_O gate_i, and `fusion.certify` gives a lower bound of the first term. Nodes whose
+is at least min sum_I E_i + sum_O gate_i, and `fusion.certify` gives a lower bound of the first term. Nodes whose
 bound exceeds the best error known are cut off; when none is left, that error is proven to be the least. E_i is the
 local pose function with its covariance frozen at the given solution, so the proof holds for that quadratic error. This
 changes little for classes 1, 2, 3, 5 and 9, whose residuals have a constant covariance up to the object's rotation; for

@@ -1,6 +1,6 @@
 """The minima of the truncated error sum min(f_i, gate_i), found from small subsets and refined on the exact functions.
 
-The gate passes 99.9 % of good measurements (notes/fusion.md, "Robust").
+The gate passes 99.9 % of good measurements.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from fusion.solve.placement import place
 from hal.arrays import Array
 
 Flags = NDArray[np.bool_]
-MOST_SEARCHED = 96  # measurements that the search looks at; the finish uses all
-HYPOTHESES = 6000  # at most
+MOST_SEARCHED = 96  # largest number of measurements in the search; the final solution uses all
+HYPOTHESES = 6000  # largest number of hypotheses
 FIRST_ROUND = 32
-MISS_PROBABILITY = 1e-4  # of never drawing a clean subset that also converges
-CONVERGES = 0.25  # share of clean subsets that reach their pose from a random rotation (measured 0.27)
+MISS_PROBABILITY = 1e-4  # probability of drawing no clean subset that also converges
+CONVERGES = 0.25  # share of clean subsets that converge from a random rotation (measured 0.27)
 SETTLED_PER_ROUND = 8
 LARGEST_ROUND = 512
-SCARCE_DOF = 8  # with no more constraints than this, several poses may fit that no symmetry joins
-EVERYWHERE = 256  # hypotheses to find all of them from
-MOST_POSES = 32  # of those that are settled; two closer than ALIKE_RAD and ALIKE_M (unsettled as they are) are one
+SCARCE_DOF = 8  # with at most this many constraints, several poses may fit that are not related by a symmetry
+EVERYWHERE = 256  # number of hypotheses from which all such poses are searched
+MOST_POSES = 32  # largest number of them to settle; poses closer than ALIKE_RAD and ALIKE_M count as one
 ALIKE_RAD, ALIKE_M = 0.02, 0.002
 AIMED = (2, 3, 5, 6, 8, 9)  # classes whose object feature has a direction
-MOST_MIRRORED = 16  # minima whose mirror images are looked for
-READMITTED = 3  # cheapest candidates whose rejected measurements are tried again
-ALTERNATIVE_COST = 18.0  # a minimum this much worse has odds below 1e-4
+MOST_MIRRORED = 16  # number of minima whose mirror images are tried
+READMITTED = 3  # number of cheapest candidates whose rejected measurements are tried again
+ALTERNATIVE_COST = 18.0  # a minimum that is worse by more than this has odds below 1e-4
 SAME_SIGMAS = 6.0  # minima closer than this are one
 # Minima with a free motion are the same within this angle, because their information is only local.
 FREE_COSINE = math.cos(0.5)
@@ -149,7 +149,7 @@ def _draws(rng: np.random.Generator, count: int) -> Array:
 def _everywhere(b: Batch, rng: np.random.Generator) -> Candidates:
     """Return settled poses from many hypotheses, one per group of similar ones; three rays, say, fit up to four.
 
-    `_search` stops once it has a pose that cannot be improved, which says nothing of other poses that fit as well.
+    `_search` stops at a pose that cannot be improved and may miss other poses that fit equally well.
     """
     draws = _draws(rng, EVERYWHERE)
     R, t, cost = np.empty((EVERYWHERE, 3, 3)), np.empty((EVERYWHERE, 3)), np.empty(EVERYWHERE)

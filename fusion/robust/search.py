@@ -1,7 +1,7 @@
-"""Poses from small random subsets, and their refinement on the inliers, compiled (notes/fusion.md, "Robust").
+"""Computes poses from small random subsets and refines them on the inliers, compiled.
 
-Annealed truncation alone loses the right pose when a quarter of the measurements are bad; random subsets that happen to
-be free of outliers do not. A subset has one more degree of freedom than the 6 unknowns, so that it can be checked.
+Annealed truncation alone loses the right pose when a quarter of the measurements are bad; random subsets, some of which
+are free of outliers, do not. A subset has one more degree of freedom than the 6 unknowns, so that it can be checked.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from fusion.solve.placement import place
 from hal.arrays import Array
 from hal.jit import as_numpy_scalar, compiled, inlined
 
-SUBSET_DOF = 7  # six unknowns and one for a check; 8 finds clean subsets a third less often
-SUBSET_MOST = 8  # measurements in a subset
+SUBSET_DOF = 7  # six unknowns and one for a check; with 8, clean subsets are found a third less often
+SUBSET_MOST = 8  # largest number of measurements in a subset
 ROTATIONS = 3
 DRAWS = SUBSET_MOST + 4 * ROTATIONS  # random numbers a hypothesis uses: picks and quaternions
 STEPS, ANNEAL_STEPS = as_numpy_scalar(12), as_numpy_scalar(4)
 ANNEALED, AS_IT_IS = as_numpy_scalar(True), as_numpy_scalar(False)
 FIT_LIMIT = 60.0  # a subset with a larger error at its own pose contains outliers
-LEAST_GAIN = 1e-6  # of truncated error, below which two are equal
+LEAST_GAIN = 1e-6  # two truncated errors that differ by less count as equal
 ANNEAL = (8.0, 4.0, 2.0, 1.0)
-OTHERS = 2  # hypotheses of another attitude that are settled too, because the cheapest are often all one pose
-OTHER_ATTITUDE = 2.86  # trace of the turn between two of one attitude: 0.38 rad
-OTHER_COST = 23.0  # of truncated error above the cheapest, up to which a hypothesis may become another answer
+OTHERS = 2  # hypotheses of other attitudes that are settled too, because the cheapest ones are often the same pose
+OTHER_ATTITUDE = 2.86  # least trace of the rotation between two poses of the same attitude (0.38 rad)
+OTHER_COST = 23.0  # largest truncated error above the cheapest one, for a hypothesis that may become an alternative
 
 
 @inlined

@@ -13,7 +13,7 @@ from hal.geometry import UncertainPose, matrix_of, skew
 
 SMALLEST_SIGMA_M = 1e-6  # no position is known better than a micrometre
 SMALLEST_SIGMA_RAD = 1e-6
-STEP = 1e-5  # of the central differences, in units of a parameter's standard deviation scale (m, rad, px alike)
+STEP = 1e-5  # of the central differences, in the unit of the parameter (m, rad or px)
 
 
 def sensed_by(

@@ -1,4 +1,4 @@
-"""Motions of the object that the measurements leave free, in words (notes/fusion.md, "Mirrors, rank")."""
+"""Finds the motions of the object that the measurements do not determine, and describes them in words."""
 
 from __future__ import annotations
 

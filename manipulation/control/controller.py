@@ -53,7 +53,7 @@ from manipulation.plausibility.hand import TouchMonitor
 from manipulation.plausibility.repetition import RepeatedWrench
 
 TARE_S = 0.1
-LATE_TICKS = 2  # a longer tick delays the motion; catching up 50 ms turned an approach at 0.06 m/s into 0.25 m/s
+LATE_TICKS = 2  # a longer tick delays the motion; catching up 50 ms would raise an approach of 0.06 m/s to 0.25 m/s
 SLOW_TICKS = 4  # gripper and proximity sensors are read once per this many ticks
 
 

@@ -14,8 +14,8 @@ from hal.motion import Guard, Quantity
 from manipulation.arm import kernels as arm_kernels
 
 RISE_WINDOW_S = 0.4
-RISE_AFTER_S = 0.15  # a motion that begins under load first builds that load up again; a networked arm is 50 ms later
-RISE_SAMPLE_S = 0.016  # the running median is refreshed at 62 Hz; a contact rises within a few of these
+RISE_AFTER_S = 0.15  # a motion that begins under load first builds up that load; a networked arm needs 50 ms more
+RISE_SAMPLE_S = 0.016  # the running median is updated at 62 Hz; the force of a contact rises within a few updates
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 GRAVITY_M_PER_S2 = 9.80665
 RANGE_WAIT_S = 0.004
 READ_WAIT_S = 0.02  # longest wait of one tick for a device; a tick itself lasts 2 to 8 ms
-PACED_WAIT_S = 1.0  # the same on a clock that stops while waiting: a busy computer is not a broken device
+PACED_WAIT_S = 1.0  # the same on a clock that stops while waiting, because a busy computer is not a broken device
 STALE_WAIT_S, STALE_STEP_S = 0.1, 0.002
 COMMAND_WAIT_S = 0.25  # for commands sent over a slow bus once per motion, not every tick
 
@@ -67,7 +67,7 @@ class DeviceFailure(Exception):
     """A device could not be used in this tick; `device` names it."""
 
     def __init__(self, device: str, cause: str) -> None:
-        # Some drivers begin with their name.
+        # The messages of some drivers begin with the name of the device.
         super().__init__(cause if cause.startswith(device) else f"{device}: {cause}")
         self.device = device
         self.cause = cause

@@ -19,7 +19,7 @@ START_RAD = 0.05
 START_M = 0.005
 SPEED_SLACK = 1.05
 RESTING_RAD_PER_S = 1e-4
-LOOK_BACK_TICKS = 3  # with one, 10 % of jitter in the ticks triples the following error of a steady motion
+LOOK_BACK_TICKS = 3  # with one, a jitter of 10 % in the ticks triples the following error of a steady motion
 
 
 class SetPointLimiter:

@@ -1,4 +1,4 @@
-"""Ends a motion early: by the stop latch, by its caller, by its own guards, and by the guards of every motion."""
+"""Decides when a motion ends early: by the stop latch, its caller, its own guards, or the guards of every motion."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from manipulation.control.sensing import Sample, ToolReading
 from manipulation.plausibility.arm import FOLLOWING_LIMIT_M
 
 TRACKING_TICKS = 5
-LOADED_START_RATIO = 1.2  # without this, a jammed hand could never be freed
+LOADED_START_RATIO = 1.2  # a motion that starts under load gets this higher limit, so that a jammed hand can be freed
 RAN = "ran to its declared end"
 SETTLE_S = 0.3
-CATCH_UP_S = 2.0  # for a set-point that speed limits hold back
+CATCH_UP_S = 2.0  # additional time for a set-point that speed limits have delayed
 SETTLED_RAD = 2e-4
 SETTLED_RAD_PER_S = 0.02
 UNITS = {

@@ -14,7 +14,7 @@ from manipulation.arm.kinematics import Kinematics
 from manipulation.planning import clearance
 from manipulation.planning.shapes import Capsule, CollisionBox
 
-RECHECK_RAD = 0.005  # the requirement: no collision when re-checked every 5 mrad
+RECHECK_RAD = 0.005  # a path must have no collision when it is checked every 5 mrad
 SELF_SAMPLES = 400  # random joint vectors that show which pairs of links always touch
 
 

@@ -1,7 +1,7 @@
 """RRT-Connect in joint space.
 
-It is not taken from ompl, because it needs a seed per plan instead of one per process, and no call back into Python for
-every state (a check takes microseconds, so the whole search is a few compiled calls).
+OMPL is not used, because it has one random seed per process instead of one per plan, and calls Python for every state.
+Here a check takes microseconds, and the whole search consists of a few compiled calls.
 
 Source: Kuffner and LaValle, ICRA 2000; shortcuts after Geraerts and Overmars, IJRR 26(8), 2007.
 """

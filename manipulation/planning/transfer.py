@@ -17,7 +17,7 @@ from manipulation.planning.time_parameterization import SpeedLimits, timed
 
 SEARCH_STEP_RAD = 0.02  # checking step of the search; the result is checked again at RECHECK_RAD
 DETOUR_RAD = 0.8  # how far a joint may leave the range between its two ends in the first search
-END_SHARE = 0.9  # of the gap at an end: with all of it the end itself would violate the margin
+END_SHARE = 0.9  # of the gap at an end; with all of it the end itself would violate the margin by rounding
 CORNER_RAD = 0.25  # how far before a corner its rounding begins
 
 
@@ -29,8 +29,8 @@ class Effort:
     nodes: int
 
 
-THOROUGH = Effort(searches=4, nodes=4000)  # ten seconds where there is no path
-QUICK = Effort(searches=2, nodes=400)  # the searches of four missions took at most 24 nodes
+THOROUGH = Effort(searches=4, nodes=4000)  # takes ten seconds if there is no path
+QUICK = Effort(searches=2, nodes=400)  # far more than the searches of typical missions need (at most 24 nodes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,7 +99,7 @@ class TransferPlanner:
         return min(self.margin_m, *(END_SHARE * gap for gap in gaps))
 
     def _search_range(self, start: Array, goal: Array) -> tuple[Array, Array]:
-        """Return joint limits a little beyond the two ends: whole turns of the wrist are never the short way."""
+        """Return joint limits a little beyond the two ends, because a whole turn of the wrist is never necessary."""
         kin = self.model.kinematics
         lower = np.maximum(kin.lower_rad, np.minimum(start, goal) - DETOUR_RAD)
         upper = np.minimum(kin.upper_rad, np.maximum(start, goal) + DETOUR_RAD)

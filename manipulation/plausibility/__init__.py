@@ -1,6 +1,6 @@
 """Plausibility checks: readings of devices compared with each other, with commands and with geometry.
 
-Nothing here reads a device or raises. Readings go in, a `Finding` or None comes out, and the caller reports it.
+The functions do not read devices or raise. They take readings and return a `Finding` or None for the caller to report.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compares the arm's reported position with the one its drives hold: a wrong one would make the arm jump."""
+"""Compares the arm's reported position with that of its drives, because a wrong one would make the arm jump."""
 
 from __future__ import annotations
 

@@ -15,9 +15,9 @@ from manipulation.plausibility.finding import Finding, Symptom
 
 WIDTH_OFF_M = 0.003  # pads at rest that hold nothing are nearer than this to the commanded width
 FELT_N = 8.0  # twice the hand's inertial force in a transfer, and far above the threshold of a touch switch
-NEAR_TIPS_M = 0.03  # lever arm of a force about the tips: the fingers do not feel a force that acts further up
+NEAR_TIPS_M = 0.03  # largest lever arm of a force about the tips; the fingers do not sense a force further up
 UNFELT_S = 0.05
-QUIET_S = 20.0  # after a finding: the hand must be able to leave what it pushes on
+QUIET_S = 20.0  # no further finding for this time, so that the hand can leave the object that it pushes on
 FREE_N = 5.0
 FREE_WAY_M = 0.15  # longer than any retreat, after which a finger has left whatever it touched
 

@@ -1,4 +1,4 @@
-"""Finds sensors that repeat one reading under new time stamps, which the noise of a working sensor rules out."""
+"""Finds sensors that repeat one reading under new time stamps, which is impossible for a working sensor with noise."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from manipulation.skills.outcome import Outcome, SkillFailure
 
 APPROACH_M_PER_S = 0.06
 CONTACT_N = 8.0
-STANDOFF_M = 0.030  # of the tips above the object's highest point
+STANDOFF_M = 0.030  # distance of the tips from the object's highest point
 RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
@@ -71,7 +71,7 @@ class Attempt:
         return self.context.kinematics.tool(self.joints(), self.context.flange_from_grip)
 
     def open_to(self, width_m: float, *, force_n: float = LET_GO_N, name: str = "set opening") -> None:
-        """Move the pads to an opening while the arm holds; does nothing when they are closed and shall be closed."""
+        """Move the pads to an opening while the arm holds; does nothing if closed pads are to be closed."""
         width = min(width_m, self.context.hand.max_width_m)
         if max(width, self.context.mover.state().gripper_width_m) <= CLOSED_M:
             return

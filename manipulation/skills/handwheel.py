@@ -19,11 +19,11 @@ from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.perform import perform
 
-HUB_M = 0.009  # the panel file does not say how thick the hub is; this is generous
+HUB_M = 0.009  # generous radius of the hub, which the panel file does not give
 SIDE_M = 0.009  # largest free space between each finger and the rim when approaching
 SPARE_M = 0.001
-TIP_DEPTH_M = 0.008  # of the tips below the middle of the rim
-FRICTION = 0.6  # of pads on paint; a low value is the safe side
+TIP_DEPTH_M = 0.008  # depth of the tips below the middle of the rim
+FRICTION = 0.6  # coefficient of the pads on paint; the low value makes the grip firm enough
 FIRMER_RATIO = 1.4  # the first grasp is light, because a firm one caused 97 N of friction along the fingers
 GRIP_FLOOR_N = 12.0
 LARGEST_GRIP_N = 45.0
@@ -34,8 +34,8 @@ EFFORT_FLOOR_N = 30.0
 LARGEST_STOP_N = 92.0
 TOLERANCE_RAD = np.radians(6.0)
 INF = float("inf")
-# Hub and plate are known to a few millimetres only, so the hand yields along the radius and the axis, and the rim
-# guides it round.
+# Hub and plate are known only to a few millimetres, so the hand is compliant along the radius and the axis, and the rim
+# guides it.
 RADIAL = Compliance(
     stiffness=(50.0, INF, 400.0, INF, INF, INF),
     damping=(1000.0, 1000.0, 1500.0, 10.0, 10.0, 10.0),

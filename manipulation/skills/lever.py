@@ -24,11 +24,11 @@ FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long l
 APPROACH_SIDE_M = 0.010  # free space on each side when approaching; more than the pose error
 CAGE_SIDE_M = 0.002  # free space on each side in the stroke: the bar is enclosed, not squeezed
 STROKE_M_PER_S = 0.08
-LAST_RAD = np.radians(9.0)  # slow over this angle: at full speed the end stop was met with more than 300 N
-OVERTRAVEL_RAD = np.radians(12.0)  # play of the cage and give of the pads
+LAST_RAD = np.radians(9.0)  # the last part is slow; at full speed the force at the end stop exceeds 300 N
+OVERTRAVEL_RAD = np.radians(12.0)  # play between fingers and bar, and compression of the pads
 LAST_M_PER_S = 0.018
 END_RISE_N = 8.0
-# If the tool stops further before the state than this, it was friction and not the end stop.
+# If the tool stops by more than this angle before the state, the cause is friction and not the end stop.
 SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
 EFFORT_SPREAD = 1.6
@@ -37,8 +37,8 @@ LARGEST_STOP_N = 92.0  # below the cell's protective limit, to tell a stiff valv
 MOVED_RAD = np.radians(12.0)
 TOLERANCE_RAD = np.radians(8.0)
 INF = float("inf")
-# Stiff across the bar, where the work is done. Along the bar and the fingers the hand yields, because a pose error
-# would build up friction there (25 N of 60) that releases in jumps.
+# Stiff across the bar, in the direction of the stroke. Along the bar and the fingers the hand is compliant, because a
+# pose error would build up friction there (25 N of 60) that is released in jumps.
 YIELDING = Compliance(
     stiffness=(INF, 1000.0, 2000.0, INF, INF, INF),
     damping=(1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0),

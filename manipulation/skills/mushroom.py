@@ -13,7 +13,7 @@ def mushroom(
     cap: Mushroom,
     target: str = "pressed",
     *,
-    current: ObjectState | None = None,  # noqa: ARG001 - a second press leaves a latched cap latched
+    current: ObjectState | None = None,  # noqa: ARG001 - not needed, because a second press leaves a latched cap latched
     verify: Verify | None = None,
 ) -> SkillReport:
     """Press the mushroom until it latches.

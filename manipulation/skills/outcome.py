@@ -15,11 +15,11 @@ class Outcome(StrEnum):
     """How a skill ended."""
 
     DONE = "done"  # the read-back confirms it
-    STIFF = "stiff"  # it did not move within the force expected from the panel file
-    STALLED = "stalled"  # it moved, and stopped before the target
-    SLIPPED = "slipped"  # the hand completed the stroke, the object did not
+    STIFF = "stiff"  # the object did not move within the force expected from the panel file
+    STALLED = "stalled"  # the object moved but stopped before the target
+    SLIPPED = "slipped"  # the hand completed the stroke, but the object did not follow
     MISSED = "missed"  # the object was not where it was expected
-    FORCE_LIMIT = "force_limit"  # the protective force limit ended it
+    FORCE_LIMIT = "force_limit"  # the protective force limit ended the stroke
     UNREACHABLE = "unreachable"  # no collision-free path
     UNVERIFIED = "unverified"  # mechanically finished; no read-back confirms it
 
@@ -38,7 +38,7 @@ class ObjectState:
     sigma: float = 0.0
 
 
-SURE = 2.0  # sigmas added to the error, because a cap that is 2.36 % off may be read as 1.9 % with 2 % allowed
+SURE = 2.0  # sigmas added to the error; otherwise an object outside of the tolerance may be read as inside it
 
 
 def surely_within(measured: float | None, goal: float, allowed: float, *, sigma: float) -> bool:

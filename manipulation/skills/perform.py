@@ -1,4 +1,4 @@
-"""The frame of every skill: a stroke, a read-back, and at most two more tries while they disagree."""
+"""The common sequence of all skills: a stroke, a read-back, and at most two more attempts if they disagree."""
 
 from __future__ import annotations
 

@@ -17,14 +17,14 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.perform import MAX_ATTEMPTS, perform
 from manipulation.skills.probe import TURNS_RAD
 
-SEEK_N = 2.5  # a light contact ends the fast part, so that the slow part always begins above or on the cap
+SEEK_N = 2.5  # a light contact ends the fast part of the approach, so that the slow part begins above or on the cap
 SEEK_ABOVE_M = 0.004
 PRESS_M_PER_S = 0.020
 STOP_FLOOR_N = 15.0
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 BOTTOM_N = 6.0  # beyond the spring force at full travel, where the cap is at its stop
-DEEP_ENOUGH_RATIO = 0.3  # a latched cap has only this much travel left
-LOST_M = 0.018  # how far behind its expected place the cap may be, plus the give of the soft push
+DEEP_ENOUGH_RATIO = 0.3  # share of the travel that counts as a press; a latched cap has no more travel than this
+LOST_M = 0.018  # largest distance of the cap behind its expected place, plus the compression of the soft push
 
 
 def press(

@@ -18,13 +18,13 @@ from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.perform import perform
 
-TIP_HEIGHT_M = 0.007  # of the fingertip over the plate: low on the cap, but a pose error does not make it scrape
+TIP_HEIGHT_M = 0.007  # height of the fingertip above the plate; with a pose error it does not touch the plate
 SIDE_M = 0.009  # free space between fingertip and cap when approaching
 SEEK_M = 0.022
 SEEK_M_PER_S = 0.02
 SEEK_N = 1.3  # below the friction of a light slider, above noise and inertia
 PUSH_M_PER_S = 0.05
-SHORT_M = 0.003  # the push pauses this far before the end to measure the give of the pads
+SHORT_M = 0.003  # the push pauses at this distance from the end to measure the compression of the pads
 TOLERANCE_RATIO = 0.02
 
 

@@ -1,4 +1,4 @@
-"""Sweep a line scanner on the wrist: turn it about its own x axis, so that its lines become an image."""
+"""Sweeps a line scanner with the wrist: turns it about its own x axis, so that its lines form an image."""
 
 from __future__ import annotations
 

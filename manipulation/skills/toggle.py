@@ -20,10 +20,10 @@ from manipulation.skills.perform import perform
 PIVOT_M = 0.004  # the bat turns a little above the plate
 GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a lever arm, low enough not to slip off
 SIDE_M = 0.008  # free space between fingertip and bat when approaching; more than the pose error
-BEYOND_M = 0.013  # how far past the middle the fingertip's face goes if nothing stops it
+BEYOND_M = 0.013  # distance of the fingertip's face beyond the middle at the end of a free sweep
 SWEEP_M_PER_S = 0.03
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
-END_N = 4.0  # beyond the force of the detent, where the bat is at its stop
+END_N = 4.0  # added to the force of the detent, so that the bat is at its stop
 
 
 class Handle(Protocol):
@@ -68,7 +68,7 @@ def toggle(
     current: ObjectState | None = None,
     verify: Verify | None = None,
 ) -> SkillReport:
-    """Throw the toggle to `on` (up) or `off` (down); one that is there already is only read.
+    """Throw the toggle to `on` (up) or `off` (down); a toggle that has the target state already is only read.
 
     The mechanical estimate in the report is how far past the pivot the fingertip's face came, m; more than 0 means that
     the toggle was thrown.

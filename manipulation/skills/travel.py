@@ -21,7 +21,7 @@ from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import SkillFailure
 from manipulation.skills.retreat import retreat
 
-ENOUGH_CONDITIONING = 0.06  # smallest singular value over the largest: below it, small moves need fast wrists
+ENOUGH_CONDITIONING = 0.06  # least ratio of smallest to largest singular value; below it small moves need fast wrists
 CLEAR_M = 0.004
 MOST_TRIES, MOST_THOROUGH = 24, 3  # goals that are searched for quickly, and then thoroughly
 # Largest turn of a joint that counts as near; a move to another branch of the arm takes 3.9 s instead of 1.1 s.

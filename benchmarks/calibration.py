@@ -1,7 +1,7 @@
-"""`panelwright calibrate` in the simulator against the truth that the seed drew: `python -m benchmarks.calibration`.
+"""Compares `panelwright calibrate` in the simulator with the truth of the seed: `python -m benchmarks.calibration`.
 
-Every seed is a cell of its own with sensors that sit a little off their records. The truth is asked for after the record
-has been written, from the simulator's own draws.
+Every seed is a cell whose sensors differ slightly from their calibration records. After the new record has been
+written, it is compared with the simulator's true values.
 """
 
 from __future__ import annotations

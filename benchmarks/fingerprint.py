@@ -1,10 +1,10 @@
-"""Fingerprint what the product answers, so that a change of structure can be shown to change nothing.
+"""Computes fingerprints of the product's answers, to prove that a change of structure does not change them.
 
 python -m benchmarks.fingerprint OUT.json               missions 1-3 and the development cases of every subject
 python -m benchmarks.fingerprint OUT.json --against REF.json   the same, and exit code 1 where a fingerprint differs
 
-A fingerprint is the SHA-256 of an answer file without its times. `OUT.json` keeps the answers beside the fingerprints,
-so that a difference can be looked at. The cases are those of `../shared/data`.
+A fingerprint is the SHA-256 of an answer file without its times. `OUT.json` contains the answers beside the
+fingerprints, so that differences can be examined. The cases are those of `../shared/data`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Nine-class fusion against its bound, mismatches, brute force, the clock and its peers.
+"""Measures nine-class fusion: errors against their bound, mismatches, brute force, times, and other methods.
 
 python -m benchmarks.fusion CASES.json OUT.json [--time]    solve a file of cases (schema of data/fusion)
 python -m benchmarks.fusion [--quick] [--no-pose]           print the table, pass line beside measured value
 
-Four-light rows and their peers (cv2, poselib, gtsam) come last; `python -m benchmarks.pose` has them with more problems.
+Rows of the four-light pose (with cv2, poselib, gtsam) come last; `python -m benchmarks.pose` prints them with more
+problems.
 """
 
 from __future__ import annotations

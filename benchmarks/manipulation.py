@@ -1,10 +1,10 @@
-"""How well the hand works the simulated panel: every skill over many seeds, with a panel pose that is wrong.
+"""Measures the skills on the simulated panel: every skill over many seeds, with a wrong panel pose.
 
     python -m benchmarks.manipulation [--skills lever,slider,...] [--seeds 20] [--first 1] [--error-mm 3]
     [--error-deg 1]
 
-Success is judged by the simulator's truth after the skill has ended, not by what the skill says. A `done` that the
-truth does not bear out counts as false.
+Success is judged by the simulator's truth after the skill has ended, not by the skill's report. A `done` that the truth
+does not confirm counts as false.
 """
 
 from __future__ import annotations

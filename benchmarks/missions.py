@@ -1,6 +1,7 @@
-"""Whole missions over seeds, judged: `python -m benchmarks.missions [FIRST LAST] [--cell FILE]`; a table and the pass lines.
+"""Runs and judges whole missions over seeds: `python -m benchmarks.missions [FIRST LAST] [--cell FILE]`.
 
-Every mission runs through the real server, as `panelwright demo --seed N --judge` does.
+Every mission runs through the real server, as by `panelwright demo --seed N --judge`. Prints a table and the pass
+lines.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Four-light pose against its bound, its mirrors, the clock and its peers.
+"""Measures the four-light pose: errors against their bound, mirror poses, times, and other libraries.
 
 python -m benchmarks.pose CASES.json OUT.json [--time]    solve a file of problems (schema of data/pose)
 python -m benchmarks.pose [--quick]                       print the table, pass line beside measured value

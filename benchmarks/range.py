@@ -1,4 +1,4 @@
-"""Range benchmark: predictions for given cases, or the whole table of issue goals on development scenes.
+"""Range benchmark: predictions for given cases, or the whole table of goals on development scenes.
 
 python -m benchmarks.range CASES_DIR OUT_DIR [--time] [--codes]   predictions in the scorer's format, mm
 python -m benchmarks.range [--seeds N]                            the table: pass line beside measured value

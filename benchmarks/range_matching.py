@@ -1,10 +1,10 @@
-"""Model matching: panels of ten kinds of component behind boards that hide 40 % of each, and what was found of them.
+"""Measures model matching on panels with ten kinds of component, each behind a board that hides 40 % of it.
 
 python -m benchmarks.range_matching [--seeds N] [--first S]
 
-Every component of a scene gets a board of its own, nearer than the component, that covers 40 % of its pixels from one
-side or across its middle. Balls and boxes that no model describes stand between. A match is right when it names the
-component's kind within 10 mm of its place; a component that other boards hide by more than half is nobody's mistake.
+Every component of a scene has its own board in front of it, which covers 40 % of its pixels from one side or across the
+centre. Between the components are balls and boxes without a model. A match is right if it has the component's kind and
+is within 10 mm of its position; a component of which other boards hide more than half is not counted.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What each pass of the range segmentation earns: every pass is left out in turn, on scenes drawn afresh.
+"""Measures the benefit of each pass of the range segmentation: every pass is left out in turn, on newly drawn scenes.
 
 python -m benchmarks.range_passes [--first-seed N] [--seeds N] [--only SUBJECT]
 
-Each image is analysed as it is and once without each pass, so that the comparison is paired. Printed per subject and
-pass: how many more regions are right at an overlap of 0.8 and of 0.9 (Hoover et al., IEEE PAMI 18(7), 1996) without the
-pass, how many more regions lie within none of truth, in how many images it is worse or better, and its processor time
+Each image is analysed with all passes and once without each pass, so that the comparison is paired. Printed per subject
+and pass: how many more regions are right at an overlap of 0.8 and of 0.9 (Hoover et al., IEEE PAMI 18(7), 1996) without
+the pass, how many more regions are spurious, in how many images the result is worse or better, and the pass's CPU time
 relative to the whole chain.
 """
 

@@ -1,13 +1,13 @@
-"""How range analysis scales: the paper's Fig. 9 for tiles, and batches of scans on many workers.
+"""Measures how range analysis scales: with tiles (the paper's Fig. 9), and with batches of scans on many workers.
 
     python -m benchmarks.range_scaling [--folder RECORDINGS]
 
 Tiles: every pixel step of the chain is timed tile by tile; the critical path is the slowest tile of each step, plus one
-barrier a step, plus log2(P) rounds of seam merges, plus what is not tiled (region fits). Two costs of talking: shared
-memory (10 us a barrier) and messages (50 us and 10 Gbit/s for the halo rows).
+barrier per step, plus log2(P) rounds of seam merges, plus the steps without tiles (region fits). Two communication
+costs are assumed: shared memory (10 us per barrier) and messages (50 us, and 10 Gbit/s for the halo rows).
 
-Batches: tasks are timed on one and on two workers, and a discrete-event simulation that serves tasks of those lengths
-must end when the real run ended. It is then carried to 1024 workers, with stragglers and one lost worker.
+Batches: tasks are timed on one and on two workers, and a discrete-event simulation with tasks of these lengths must end
+when the real run ended. The simulation is then extended to 1024 workers, with stragglers and one lost worker.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Panel vision against the issue's table: `python -m benchmarks.vision INPUTS.json OUT.json [--time] [--least-confidence X]`.
+"""Measures panel vision: `python -m benchmarks.vision INPUTS.json OUT.json [--time] [--least-confidence X]`.
 
-Without arguments it runs the development images beside the repository and prints measured values beside the pass lines,
-then the robustness axes one by one. Formats: the data folder's README. Readings less sure than X (default 0.5) are refused; 0 gives
-best guesses with their confidences.
+Without arguments it reads the development images beside the repository and prints measured values beside the pass
+lines, then each robustness axis. The README of the data folder describes the formats. Readings with a confidence below
+X (default 0.5) are refused; 0 gives best guesses with their confidences.
 """
 
 from __future__ import annotations

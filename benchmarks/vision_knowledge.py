@@ -1,12 +1,13 @@
-"""Teach the shipped kinds from labelled overviews, and try what was taught on overviews that it has not seen.
+"""Teaches the shipped kinds from labelled overviews, and tests the result on held-out overviews.
 
 `python -m benchmarks.vision_knowledge FOLDER` prints recall, precision and calibration of three folds of the overviews
-beside the repository, then writes one archive (`.npz`) per kind, taught on all of them, into FOLDER. The shipped files were made
-this way: one look an object at its true middle, the looks of places that are no object, and of both only those that the ones
-kept so far do not tell with a margin (`perception.vision.teaching.condense`). Overviews in good light also teach what they
-would look like in bad light: drawn again with slopes of light, glare, shadow, cables, blur and noise (`panel_scene`), they
-give further looks, which count in noisy images only. With `--only-noisy` these alone are taught, beside what is shipped for
-every image: so the shipped ones were made, as those for every image are older than the bridging of cables, and no worse.
+beside the repository, then writes one archive (`.npz`) per kind, taught on all overviews, into FOLDER. The shipped
+files were made in this way. There is one look per object at its true centre, and there are looks of places without
+object; of both only those are kept that the other looks do not recognise with a margin
+(`perception.vision.teaching.condense`). Overviews in good light also teach further looks, which are used in noisy
+images only: they are degraded by uneven light, glare, shadow, cables, blur and noise (`panel_scene`). With
+`--only-noisy` only these are taught, in addition to the shipped looks for all images. The shipped looks for noisy
+images were made in this way.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Blind recognition of the simulated cell's own panel, as its users get it; and the looks that ship with that cell.
+"""Measures blind recognition of the simulated cell's panel, and teaches the looks that ship with that cell.
 
-`python -m benchmarks.vision_simulated [FIRST LAST]` asks POST /v1/recognise (blind) of every seed, before and after the
-panel is located, and prints recall, precision and reliability: only here is asked what was built where. With `--teach FOLDER`
-every seed teaches in turn through POST /v1/learn, and the looks that the shipped kinds lack are written into FOLDER.
-`cells/knowledge/bench` was made so, of seeds 1 to 6.
+`python -m benchmarks.vision_simulated [FIRST LAST]` sends POST /v1/recognise (blind) for every seed, before and after
+the panel is located, compares the answers with the simulator's truth, and prints recall, precision and reliability.
+With `--teach FOLDER` every seed teaches by POST /v1/learn, and the looks that are not shipped yet are written into
+FOLDER. `cells/knowledge/bench` was made in this way from seeds 1 to 6.
 """
 
 from __future__ import annotations

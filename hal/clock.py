@@ -14,7 +14,7 @@ TICKS_KEPT = 512
 
 
 class Clock(Protocol):
-    """A monotonic clock; `sleep` returns when that much of *this* clock's time has passed."""
+    """Monotonic clock; `sleep` returns when that much of *this* clock's time has passed."""
 
     def now_s(self) -> float:
         """Return the seconds since an arbitrary start; never decreases."""
@@ -117,8 +117,8 @@ class PacedClock:
     def at_s(self, wall_s: float) -> float:
         """Return this clock's time when `time.monotonic` was `wall_s`; before its stored ticks it follows the wall clock.
 
-        The age of data on a wire between a cell and its simulated world is measured in this time, because a slow machine
-        delays the frames and the world equally.
+        The age of data on a link between a cell and its simulated world is measured in this time, because a slow
+        machine delays the frames and the world equally.
         """
         with self._lock:
             if wall_s >= self._ticked_at_s:

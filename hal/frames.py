@@ -38,7 +38,7 @@ class FrameTree:
         return self.links[name][0]
 
     def base_from(self, name: str) -> UncertainPose:
-        """Return `base_from_<name>`, composed from the root; the covariances are propagated as if links are independent."""
+        """Return `base_from_<name>`, composed from the root; its covariance assumes that the poses are independent."""
         chain: list[UncertainPose] = []
         while (parent := self.parent_of(name)) is not None:
             chain.append(self.links[name][1])
@@ -49,7 +49,7 @@ class FrameTree:
         return pose
 
     def pose(self, parent: str, child: str) -> UncertainPose:
-        """Return `<parent>_from_<child>` for any two frames; the covariance of links that both share counts twice."""
+        """Return `<parent>_from_<child>` for any two frames; the covariance of poses that both share counts twice."""
         if parent == BASE:
             return self.base_from(child)
         return compose(self.base_from(parent).inverse(), self.base_from(child))

@@ -57,7 +57,7 @@ class HostServer:
             return
         self._is_closed.set()
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as bell:
-            bell.connect(self.address)  # wakes `accept`; a `Client` would wait for ever if the thread has ended
+            bell.connect(self.address)  # wakes `accept`; a `Client` would wait without end if the thread has ended
         self._thread.join(timeout=1.0)
         self._listener.close()
         for connection in list(self._connections):

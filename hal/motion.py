@@ -77,7 +77,7 @@ class JointTrajectory:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CartesianPath:
-    """Tool poses at times (N,) s from 0; straight and constant turn between neighbours.
+    """Tool poses at times (N,) s from 0; between neighbours a straight line and a rotation at constant rate.
 
     The first pose must be where the tool is (within 5 mm and 0.05 rad): the executor blends from the measured pose.
     """
@@ -130,7 +130,7 @@ class MotionOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionLog:
-    """The course of a motion, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6),
+    """Record of a motion, sampled every `1/rate_hz`: times (N,), joints (N, n), contact wrench in tool axes (N, 6),
     tip (N, 3); `started_s` is the cell clock's time of the first sample."""
 
     times_s: Array
@@ -198,9 +198,9 @@ class Mover(Protocol):
         ...
 
     def tare(self) -> Array:
-        """Take the present wrench (averaged over 0.1 s at rest) as zero contact; returns the (6,) bias found."""
+        """Take the present wrench (averaged over 0.1 s at rest) as zero contact, and return the (6,) bias found."""
         ...
 
     def state(self) -> RobotState:
-        """Newest snapshot."""
+        """Return the newest snapshot."""
         ...

@@ -1,11 +1,12 @@
-"""The paper's Fig. 10 again: a scene of four objects, segmented into six regions as in 1990 and as today.
+"""Repeats the paper's Fig. 10: a scene of four objects, segmented into six regions by the methods of 1990 and of today.
 
     python -m examples.paper.range_regions [--seed N]
 
-The method of 1990 (Section III): a median against gross errors, a gaussian against measurement errors, then features of
-ever higher order, each of which parts what the one before left together - range, orientation, curvature - and a general
-quadric through each region by Givens rotations. It works on the 8-bit codes, of which the scene fills a share (Fig. 7).
-Printed: regions that overlap a surface of the scene by 0.8 either way, and how many of these bear its name.
+The method of 1990 (Section III) applies a median against gross errors, a Gaussian against measurement errors, then
+features of increasing order (range, orientation, curvature), each of which divides the regions further, and fits a
+general quadric to each region by Givens rotations. It works on the 8-bit codes, of which the scene fills a fraction
+(Fig. 7). Printed are the regions that overlap a surface of the scene by 0.8 either way, and how many of these have its
+type.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The paper's Table II and Fig. 13 again: a pose that improves measurement by measurement although the first one is bad.
+"""Repeats the paper's Table II and Fig. 13: a pose that improves with each measurement although the first one is bad.
 
     python -m examples.paper.table2 [--seed N] [--out FOLDER]
 
-Prints the paper's errors beside plain least squares over everything (its objective) beside the robust fusion, after each of the
-16 measurements, and draws the first six poses.
+Prints the paper's errors, those of plain least squares over all measurements (the paper's objective) and those of the
+robust fusion, after each of the 16 measurements, and draws the first six poses.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from hal.panel.parts import Scale
 from hal.panel.turn import TURN_RAD, beyond, meant_otherwise
 from hal.strict import unknown_key_hint
 
-UNITLESS = {"at_min", "at_max", "table"}  # keys of a scale, whose places are angles or lengths as its object says
+UNITLESS = {"at_min", "at_max", "table"}  # keys of a scale, whose positions are angles or lengths by its kind
 KNOWN_TYPES = frozenset(get_args(ErrorType))
 Location = tuple[str | int, ...]
 
@@ -38,7 +38,8 @@ def in_radians(table: Any, known: frozenset[str], at: Location = ()) -> tuple[An
     """Return a table of a panel file with every angle in radians, and the faults of angles that are given twice.
 
     Args:
-        known: keys of the models that will read it: what would be none of them stays, and is refused under its own name.
+        known: keys of the models that will read the table. A key that is not known even after conversion stays
+            unchanged, so that the model refuses it under its own name.
     """
     if isinstance(table, list):
         pairs = [in_radians(item, known, (*at, k)) for k, item in enumerate(table)]
@@ -69,7 +70,7 @@ def _radians(value: Any, *, is_table: bool) -> Any:
 
 
 def _is_a_pointers(scale: Scale) -> Scale:
-    """A scale whose places are angles: its ends are within a turn, and so is the way between them."""
+    """Check a scale whose positions are angles: its ends and the span between them must be within a full turn."""
     places: list[tuple[Location, float]] = [(("at_min",), scale.at_min), (("at_max",), scale.at_max)]
     places += [(("table", k, 0), place) for k, (place, _) in enumerate(scale.table)]
     faults = [
@@ -87,4 +88,4 @@ def _is_a_pointers(scale: Scale) -> Scale:
 
 
 PointerScale = Annotated[Scale, AfterValidator(_is_a_pointers)]
-"""A scale whose places are angles in radians, clockwise from straight up."""
+"""Scale whose positions are angles in radians, clockwise from straight up."""

@@ -1,4 +1,4 @@
-"""The room that an object takes, and the edges and surfaces that it shows, all relative to its middle on the plate."""
+"""Space that an object occupies, and its visible edges and surfaces, all relative to its centre on the plate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Vector2 = tuple[float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Face:
-    """The part of a picture that shows the object in any state: an upright rectangle, and the height above the plate of the
+    """Part of an image that shows the object in any state: an upright rectangle, and the height above the plate of the
     plane in which its reader looks at it."""
 
     half_width_m: float
@@ -20,10 +20,10 @@ class Face:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rim:
-    """An edge that every state shows: a circle of half the width, or a rectangle, at a height above the plate.
+    """Edge that is visible in every state: a circle of half the width, or a rectangle, at a height above the plate.
 
     Attributes:
-        reach_m: how far inside or outside of it a parallel edge of the same object may be the stronger one.
+        reach_m: distance inside or outside of it within which a parallel edge of the same object may be stronger.
     """
 
     shape: Literal["circle", "rectangle"]
@@ -41,13 +41,13 @@ def circle(radius_m: float, *, above_plate_m: float = 0.0, reach_m: float = 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Envelope:
-    """A box that stands on the plate and holds the object: nothing may touch what is inside.
+    """Box that stands on the plate and contains the object; nothing may enter it.
 
     Attributes:
         half_m: half its sides along its own axes.
-        height_m: how far it stands out of the plate.
-        turn_rad: counter-clockwise turn of its axes about the object's middle.
-        middle_m: the box's middle from the object's middle, along its own axes.
+        height_m: height above the plate.
+        turn_rad: counter-clockwise rotation of its axes about the object's centre.
+        middle_m: centre of the box relative to the object's centre, along the box's axes.
     """
 
     half_m: Vector2
@@ -58,14 +58,14 @@ class Envelope:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Relief:
-    """How a range image shows the object: surfaces, and how they move.
+    """Surfaces of the object in a range image, and how they move.
 
     Attributes:
-        surfaces: tables as `perception.range` takes them: name, type, point_m, direction, size_m and so on.
-        height_m: how far they stand out of the plate.
-        motion: `slide` out of the plate by `low` to `high` metres, or `turn` about the plate's normal by radians.
-        turns: the object looks alike after this share of a turn (3: after a third); 0 when it is round.
-        pressed_depth_m: of what slides: how much lower it is where it is read as pressed.
+        surfaces: tables in the format of `perception.range`: name, type, point_m, direction, size_m and so on.
+        height_m: height of the surfaces above the plate.
+        motion: `slide` along the plate's normal by `low` to `high` metres, or `turn` about it by radians.
+        turns: number of rotations in a full turn that look the same (3: every third of a turn); 0 if it is round.
+        pressed_depth_m: for `slide`, how much lower the surfaces are when the object is read as pressed.
     """
 
     surfaces: tuple[dict[str, Any], ...]

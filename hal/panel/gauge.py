@@ -11,11 +11,11 @@ from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale, radius_of
 
 LEAST_HEIGHT_M = 0.004
-"""Of what a hand keeps clear of: a flat instrument is taken for that thick."""
+"""Height that is assumed for a flat instrument when collisions with the hand are avoided, in metres."""
 
 
 class Gauge(PanelObject):
-    """Round pointer instrument; the scale's places are needle angles."""
+    """Round pointer instrument; the positions of its scale are needle angles."""
 
     kind: Literal["gauge"] = "gauge"
     radius_m: Positive

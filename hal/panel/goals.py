@@ -8,7 +8,7 @@ from typing import Literal
 from hal.errors import InvalidRequest
 
 GAUGE_SHARE = 0.02
-"""Of full scale: a reading or a control that is further off is wrong."""
+"""Fraction of full scale; a reading or a control with a larger error counts as wrong."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +25,7 @@ class StateGoal:
     """One of several states.
 
     Attributes:
-        usual: what is meant when nothing is said; None when it must be said.
+        usual: state that is meant if the request names none; None if the request must name one.
     """
 
     states: tuple[str, ...]
@@ -62,7 +62,7 @@ class StateGoal:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NumberGoal:
-    """A number from `low` to `high`, asked for under `key`, reached when it is within `tolerance`."""
+    """A number from `low` to `high`, requested under `key`, that counts as reached within `tolerance`."""
 
     key: Literal["value", "angle_rad"]
     low: float

@@ -15,7 +15,7 @@ from hal.panel.questions import Question, Taught, radius_of
 from hal.panel.turn import Turns
 
 RIGHT_RAD = 0.105
-"""A wheel that is read or turned to within 6 degrees is right."""
+"""Tolerance within which a wheel counts as read or turned correctly: 6 degrees, in radians."""
 HUB_RADIUS_M = 0.009
 SPOKE_RADIUS_M = 0.003
 

@@ -11,11 +11,11 @@ from hal.panel.gauge import LEAST_HEIGHT_M
 from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale
 
-PIVOT_SHARE, NEEDLE_SHARE = 0.28, 0.6  # of the height of a meter that is taught
+PIVOT_SHARE, NEEDLE_SHARE = 0.28, 0.6  # fractions of the height, for a meter that is taught
 
 
 class PanelMeter(PanelObject):
-    """Rectangular moving-coil meter; the pivot lies `pivot_below_m` under the middle; places are needle angles."""
+    """Rectangular moving-coil meter; the pivot is `pivot_below_m` below the centre; positions are needle angles."""
 
     kind: Literal["panel_meter"] = "panel_meter"
     width_m: Positive

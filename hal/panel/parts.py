@@ -1,4 +1,4 @@
-"""What the kinds of a panel file are described with: numbers that must be positive, lights, scales and named places."""
+"""Building blocks of the kinds' models: numbers that must be positive, lights, scales and named states."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 
 LATCHED_SHARE = 0.6
-"""Of its travel: how far a cap that latches stays in."""
+"""Fraction of its travel that a latched cap stays pressed in."""
 
 
 class Light(Strict):
-    """One border light: a lamp whose centre is known."""
+    """Border light: a lamp whose centre is known."""
 
     name: Name
     position_m: Vector3
@@ -29,10 +29,10 @@ class Light(Strict):
 
 
 class Scale(Strict):
-    """How an angle (or a length) shows a value.
+    """Scale: how an angle (or a length) shows a value.
 
-    `at_min` and `at_max` are the pointer's places at `minimum` and `maximum`; `table` holds further (place, value)
-    pairs of a scale that is not linear, in rising order of place.
+    `at_min` and `at_max` are the pointer's positions at `minimum` and `maximum`; `table` holds further (position,
+    value) pairs of a scale that is not linear, in rising order of position.
     """
 
     minimum: float
@@ -66,7 +66,7 @@ class Scale(Strict):
         return self.maximum - self.minimum
 
     def value_at(self, place: float) -> float:
-        """Return the value at a place (rad or m), linear between the given pairs and extrapolated beyond the ends."""
+        """Return the value at a position (rad or m), linear between the pairs and extrapolated beyond the ends."""
         points = self._points()
         for (p0, v0), (p1, v1) in pairwise(points):
             if place <= p1 or (p1, v1) == points[-1]:
@@ -74,7 +74,7 @@ class Scale(Strict):
         raise AssertionError("a scale has two points")
 
     def place_of(self, value: float) -> float:
-        """Return the place (rad or m) of a value, the inverse of `value_at`."""
+        """Return the position (rad or m) of a value, the inverse of `value_at`."""
         points = sorted((v, p) for p, v in self._points())
         for (v0, p0), (v1, p1) in pairwise(points):
             if value <= v1 or (v1, p1) == points[-1]:
@@ -86,7 +86,7 @@ class Scale(Strict):
 
 
 class State(Strict):
-    """A named resting place of a control; `angle_rad` clockwise from straight up (toggle: tilt, up positive)."""
+    """Named resting position of a control; `angle_rad` is clockwise from straight up (toggle: tilt, up is positive)."""
 
     name: Name
     angle_rad: Angle = 0.0

@@ -13,14 +13,14 @@ from hal.panel.angles import Location, fault
 from hal.panel.base import PanelObject
 from hal.panel.parts import Light, Vector2
 
-OVERLAP_M = 0.001  # two parts that stand in one another by less may still be meant: drawings round to millimetres
+OVERLAP_M = 0.001  # a smaller overlap of two parts is accepted, because drawings are rounded to millimetres
 PARTS = ("lights", "objects")
 Parts = Mapping[Location, Light | PanelObject]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Foot:
-    """The area that a part covers on the plate: a circle, or a rectangle turned counter-clockwise."""
+    """Area that a part covers on the plate: a circle, or a rectangle rotated counter-clockwise."""
 
     centre_m: Vector2
     half_m: Vector2

@@ -1,4 +1,4 @@
-"""What is asked about an object when a panel is taught, and what its kind needs of the answers.
+"""Questions about an object when a panel is taught, and the answers as its kind needs them.
 
 Angles are asked for in degrees, and panel files are written in degrees (`at_min_deg`, `angle_deg`).
 """
@@ -15,7 +15,7 @@ PLACES = "Its places: name=degrees clockwise from straight up, separated by comm
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Question:
-    """One step of the dialogue; `choices` is empty where any text or number will do. `default` stands if unanswered."""
+    """Question of the dialogue; `choices` is empty if any text or number is allowed; `default` if unanswered."""
 
     key: str
     text: str
@@ -24,7 +24,7 @@ class Question:
 
 
 class Taught(Protocol):
-    """An object that somebody clicked on and described: its outline in the image, and the answers about it."""
+    """Object that a user has clicked on and described: its outline in the image, and the answers about it."""
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -33,7 +33,7 @@ class Taught(Protocol):
 
     @property
     def reach_m(self) -> float:
-        """Distance in metres from the clicked place to the far end of the outline."""
+        """Distance in metres from the clicked point to the far end of the outline."""
         ...
 
     def text(self, key: str) -> str:
@@ -53,7 +53,7 @@ class Taught(Protocol):
         ...
 
     def mark_deg(self, key: str, *, pivot_below_m: float = 0.0) -> float:
-        """Return the answer as an angle in degrees, clockwise from straight up, about a pivot below the object's middle.
+        """Return the answer as an angle in degrees clockwise from straight up, about a pivot below the object's centre.
 
         Raises:
             InvalidRequest: the answer is neither an angle nor a pixel.
@@ -77,7 +77,7 @@ ENDS = (
 
 
 def about_a_pointer(low_deg: str, high_deg: str) -> tuple[Question, ...]:
-    """Return the questions about a scale whose places are angles."""
+    """Return the questions about a scale whose positions are angles."""
     return (
         *ENDS,
         Question(key="at_min", text=f"Where is the low end ({MARKS})?", default=low_deg),
@@ -91,7 +91,7 @@ def ends_of(taught: Taught) -> dict[str, Any]:
 
 
 def pointer_scale(taught: Taught, *, pivot_below_m: float = 0.0) -> dict[str, Any]:
-    """Return the answers about a scale whose places are angles, as a table of the panel file."""
+    """Return the answers about a scale whose positions are angles, as a table of the panel file."""
     at_min, at_max = (taught.mark_deg(key, pivot_below_m=pivot_below_m) for key in ("at_min", "at_max"))
     return {**ends_of(taught), "at_min_deg": at_min, "at_max_deg": at_max}
 

@@ -15,11 +15,11 @@ from hal.panel.parts import Positive, Scale, Vector2, Vector3
 from hal.panel.questions import ENDS, Question, Taught, ends_of
 from hal.panel.turn import Angle
 
-CAP_M = 0.012  # of a slider that is taught, along its track
+CAP_M = 0.012  # length of the cap along its track, for a slider that is taught
 
 
 class Slider(PanelObject):
-    """Slider on a straight track; the scale's places are metres from the track's middle along `angle_rad` from +x."""
+    """Slider on a straight track; positions of its scale are metres from the track's centre, `angle_rad` from +x."""
 
     kind: Literal["slider"] = "slider"
     angle_rad: Angle = 0.0
@@ -38,7 +38,7 @@ class Slider(PanelObject):
 
     @model_validator(mode="after")
     def _places_are_on_the_track(self) -> Slider:
-        """The scale's places are metres along the track."""
+        """Check that the scale's positions are metres along the track."""
         faults = [
             fault(
                 ("scale", key), place, f"{place:g} m is beyond the track", f"the track ends {self.travel_m / 2:g} m off"

@@ -54,10 +54,27 @@ def compiled(function: F | None = None, /, *, fastmath: frozenset[str] = frozens
     return compile_one if function is None else compile_one(function)
 
 
-def inlined(function: F) -> F:
-    """Let compiled functions call a small helper; it is compiled into each of them and stays plain Python elsewhere."""
-    kernel_cache.register_helper(function)
-    return register_jitable(error_model="numpy", nogil=True)(function)
+@overload
+def inlined(function: F, /) -> F: ...
+@overload
+def inlined(*, early: bool) -> Callable[[F], F]: ...
+
+
+def inlined(function: F | None = None, /, *, early: bool = False) -> F | Callable[[F], F]:
+    """Let compiled functions call a small helper; it is compiled into each of them and stays plain Python elsewhere.
+
+    Args:
+        function: the helper, when the decorator is used without arguments.
+        early: copy the helper's statements into the caller before types are known. This takes longer to compile. It
+            pays in the innermost loop for a helper with arrays as arguments, because passing them counts references.
+    """
+
+    def register(helper: F) -> F:
+        kernel_cache.register_helper(helper)
+        inline = "always" if early else "never"
+        return register_jitable(error_model="numpy", nogil=True, inline=inline)(helper)
+
+    return register if function is None else register(function)
 
 
 def as_numpy_scalar(value: T) -> T:

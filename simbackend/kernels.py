@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from hal.arrays import Array
+from hal.jit import compiled
 
 
-@njit(cache=True)
+@compiled
 def reachable(wanted: Array, last: Array, stride: Array, lower: Array, upper: Array) -> Any:
     """Return the set-point nearest to `wanted` that lies within the range and at most `stride` from the `last` one.
 
@@ -24,7 +24,7 @@ def reachable(wanted: Array, last: Array, stride: Array, lower: Array, upper: Ar
     return out
 
 
-@njit(cache=True)
+@compiled
 def raw_wrench(
     true: Array, bias: Array, drift: Array, phase_rad: Array, angle_rad: float, noise: Array, sigma: Array, digit: Array
 ) -> Any:

@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from hal.jit import compiled, inlined
 
 Float32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -24,7 +24,7 @@ ATTRIBUTES = 3  # shade, u, v
 BYTE = 1.0 / 255.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rasterise(  # a compiled kernel takes no keywords
     points: Array,
     attributes: Array,
@@ -59,7 +59,7 @@ def rasterise(  # a compiled kernel takes no keywords
             _triangle(corner, values, k, surface[t], albedo[t], texels, table, camera, scratch, inverse_depth, image)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _is_behind(triangle: Array, near: float) -> bool:
     """Return whether the triangle faces away from the camera or lies entirely before the near plane."""
     a, b, c = triangle[0], triangle[1], triangle[2]
@@ -72,7 +72,7 @@ def _is_behind(triangle: Array, near: float) -> bool:
     return bool(side >= 0.0)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _clip(triangle: Array, values: Array, near: float, corner: Array, out: Array) -> int:
     """Clip a triangle to the part beyond the near plane; return its number of corners: 0, 3 or 4."""
     count = 0
@@ -91,7 +91,7 @@ def _clip(triangle: Array, values: Array, near: float, corner: Array, out: Array
     return count
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _triangle(
     corner: Array,
     values: Array,
@@ -145,7 +145,7 @@ def _triangle(
             _texture(texels, offset, tw, th, u, v, shade, albedo, image, row, column)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _project(corner: Array, index: tuple[int, int, int], camera: Array, x: Array, y: Array, w: Array) -> float:
     """Fill pixel coordinates and 1/z of the three corners; return twice the area, negative for a back face."""
     for i in range(3):
@@ -157,7 +157,7 @@ def _project(corner: Array, index: tuple[int, int, int], camera: Array, x: Array
     return float((x[2] - x[0]) * (y[1] - y[0]) - (x[1] - x[0]) * (y[2] - y[0]))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _slopes(
     values: Array, index: tuple[int, int, int], x: Array, y: Array, w: Array, area: float, plane: Array
 ) -> None:
@@ -171,7 +171,7 @@ def _slopes(
         plane[a, 0], plane[a, 1], plane[a, 2] = f0 - dx * x[0] - dy * y[0], dx, dy
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined(early=True)
 def _columns(row: int, x: Array, y: Array, width: int) -> tuple[int, int]:
     """Return the first and last pixel of a row inside the triangle; the first is beyond the last if there is none."""
     left, right = 0.0, width - 1.0
@@ -189,7 +189,7 @@ def _columns(row: int, x: Array, y: Array, width: int) -> tuple[int, int]:
     return math.ceil(left - 1e-9), math.floor(right + 1e-9)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined(early=True)
 def _texture(
     texels: Bytes,
     offset: int,
@@ -217,7 +217,7 @@ def _texture(
         image[row, column, c] = shade * albedo[c] * (top * (1.0 - fv) + low * fv) * BYTE
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _level(
     values: Array, index: tuple[int, int, int], area: float, entry: NDArray[np.int64], channels: int
 ) -> tuple[int, int, int]:

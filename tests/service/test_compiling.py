@@ -64,3 +64,9 @@ def test_the_survey_names_a_kernel_of_every_room_that_has_some() -> None:
     names = [name.partition("-")[0] for name in survey()]
     for module in ("kernels", "raster", "search", "fit"):  # of planning and world, fusion, vision and range
         assert any(name.startswith(f"{module}.") for name in names), module
+
+
+@pytest.mark.skipif(not is_compiled(), reason="kernels were edited after `panelwright warm`")
+def test_warming_compiles_every_kernel_there_is() -> None:
+    """A kernel that nothing calls would be looked for in every later run."""
+    assert kernel_cache.missing(survey()) == set()

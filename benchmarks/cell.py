@@ -182,7 +182,7 @@ def _stops_while_rendering(client: Client, stop_url: str) -> list[float]:
 
 
 class _Memory:
-    """Peak of the proportional set size over this process and its children, sampled twice a second."""
+    """Peak of the proportional set size of this process and its children, sampled twice per second."""
 
     def __init__(self) -> None:
         self.peak_bytes = 0

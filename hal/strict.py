@@ -20,7 +20,7 @@ IN_DOCS = "the reference is in docs/"
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that is wrong in a file: the key path, what is wrong with its value, and the remedy."""
+    """Fault in a file: the key path, what is wrong with its value, and the remedy."""
 
     key: str
     text: str

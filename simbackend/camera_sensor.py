@@ -31,7 +31,7 @@ GLOW_STEP_PX = 4  # the glow is smooth: computed on every fourth pixel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorOptions:
-    """What corrupts an image. Radiance 1 at 10 ms is full scale."""
+    """Degradations of an image; radiance 1 at 10 ms is full scale."""
 
     exposure_s: float
     oversample: float

@@ -32,7 +32,7 @@ class Button(PanelObject):
 
     @property
     def pressed_depth_m(self) -> float:
-        """How much lower the cap is where it is read as pressed: held down, or latched."""
+        """Depth below the released cap at which it is read as pressed, that is, held down or latched."""
         return LATCHED_SHARE * self.travel_m if self.latching else self.travel_m
 
     @property

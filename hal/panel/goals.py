@@ -22,7 +22,7 @@ class Shown:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateGoal:
-    """One of several states.
+    """Goal that is one of several states.
 
     Attributes:
         usual: state that is meant if the request names none; None if the request must name one.

@@ -25,7 +25,7 @@ class Mushroom(PanelObject):
 
     @property
     def pressed_depth_m(self) -> float:
-        """How much lower a latched head is."""
+        """Depth of a latched head below a released one."""
         return LATCHED_SHARE * self.travel_m
 
     @property

@@ -1,4 +1,4 @@
-"""What the pages refer to exists: links, commands and shipped files; and there are no paths of one machine."""
+"""The links, commands and shipped files in the pages exist, and the pages contain no paths of one machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled passes over pixels and their small algebra against plain numpy."""
+"""Compares the compiled passes over pixels and their algebra with plain numpy."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ KINDS = np.array([0, PLANE, SPHERE, PLANE, CYLINDER])
 
 
 def competing_surfaces() -> np.ndarray:
-    """(5, 16) parameters of two planes, a ball and a pipe at about 0.6 m; entry 0 is unused."""
+    """Return (5, 16) parameters of two planes, a ball and a pipe at about 0.6 m; entry 0 is unused."""
     table = np.zeros((5, SIZE))
     table[1, :4] = [0.0, 0.0, -1.0, -0.62]
     table[2, :5] = [-0.05, 0.0, 0.62, 0.05, 1.0]
@@ -48,7 +48,7 @@ def competing_surfaces() -> np.ndarray:
 
 
 def random_case(sensor, seed, size=2):
-    """Depth near the surfaces with holes, and a block map of random patches."""
+    """Return depth near the surfaces, with holes, and a block map of random patches."""
     rng = np.random.default_rng(seed)
     depth = 0.6 + 0.02 * rng.normal(size=(sensor.height_px, sensor.width_px)) * (rng.random((120, 160)) < 0.5)
     depth[rng.random(depth.shape) < 0.02] = np.nan
@@ -59,7 +59,7 @@ def random_case(sensor, seed, size=2):
 
 
 def best_label(sensor, depth, v, u, near, table, own=0):
-    """First label of least misfit among `near`, by the definition; `own` wins when it fits well."""
+    """Return the first label of smallest residual among `near`, by definition; `own` is kept if it fits well."""
     packed, z = sensor.packed(), depth[v, u]
     best, label = pixel_assignment.ASSIGNMENT_SIGMAS, 0
     for k in near:
@@ -80,7 +80,7 @@ def best_label(sensor, depth, v, u, near, table, own=0):
 
 
 def around(labels, v, u):
-    """Labels of the 3x3 neighbourhood, in raster order of first sight."""
+    """Return the labels of the 3x3 neighbourhood, in raster order of their first pixel."""
     patch = labels[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].ravel()
     return list(dict.fromkeys(int(k) for k in patch if k > 0))
 
@@ -119,7 +119,7 @@ def test_only_pixels_beside_a_new_surface_are_judged_again(sensor):
             near = around(blocks, v, u)
             if not set(near) - {int(blocks[v, u])} or max(near) < newest:
                 assert out[v, u] == blocks[v, u]
-            elif (v + u) % 7 == 0:  # the plain search is slow: a seventh of them
+            elif (v + u) % 7 == 0:  # only every seventh pixel, because the plain search is slow
                 assert out[v, u] == best_label(sensor, depth, v, u, near, table)
 
 
@@ -220,7 +220,7 @@ def test_an_ellipsoids_shape_and_its_covariance_are_those_of_plain_differences()
 
 
 def test_a_sphere_is_refined_to_its_bound_and_its_covariance_is_the_inverse_information():
-    """20 noisy images of one ball: errors over sigma spread like a unit normal, also with a radius held by a prior."""
+    """In 20 noisy images of a ball, errors over sigma are standard normal, also if a prior constrains the radius."""
     rng = np.random.default_rng(5)
     sensor = OrthographicSensor(width_px=60, height_px=60, pixel_pitch_m=0.2 / 59)
     noise = NoiseModel(white=(1e-3, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))

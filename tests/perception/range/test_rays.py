@@ -1,4 +1,4 @@
-"""The loops over many rays agree with the plain functions of `surfaces`, ray by ray, and their sums with numpy."""
+"""The loops over many rays agree with the functions of `surfaces` for each ray, and their sums agree with numpy."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from perception.range.fitting.surfaces import (
 
 CENTRE = np.array([0.01, 0.02, 0.6])
 KINDS = [PLANE, SPHERE, CYLINDER, CONE, QUADRIC]
-GRAZING_RAD = 1e-3  # closer to the outline a root of a difference of rounding errors decides
+GRAZING_RAD = 1e-3  # closer to the outline the result is determined by rounding errors
 
 
 def random_surface(kind: int, rng: np.random.Generator) -> np.ndarray:
-    """Parameters of a surface half a metre away that most rays of `random_rays` meet."""
+    """Return parameters of a surface half a metre away that most rays of `random_rays` meet."""
     th = np.zeros(SIZE)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -52,7 +52,7 @@ def random_rays(perspective: bool, count: int, rng: np.random.Generator) -> tupl
 
 
 def plain_rows(kind, th, x, y, perspective):
-    """Depth, cosine (N,) and derivatives (N, p), one ray at a time by the reference."""
+    """Return depth, cosine (N,) and derivatives (N, p), computed ray by ray by the reference."""
     frame = np.zeros(6)
     frame_of(kind, th, frame)
     z, cosine, J = np.empty(x.size), np.empty(x.size), np.zeros((x.size, 9))
@@ -86,7 +86,7 @@ def test_each_ray_is_as_the_plain_function_has_it(kind, perspective):
 @pytest.mark.parametrize("scale", [0.0, 1.5])
 @pytest.mark.parametrize("kind", KINDS)
 def test_sums_are_those_of_numpy(kind, scale, perspective):
-    """300 samples are two whole chunks and a part, some gross errors, some rays that miss."""
+    """300 samples are two full chunks and a part; some have gross errors, and some rays miss."""
     rng = np.random.default_rng(10 + kind)
     th = random_surface(kind, rng)
     x, y = random_rays(perspective, 300, rng)
@@ -128,7 +128,7 @@ def test_residuals_are_in_sigmas_and_nan_where_a_ray_misses():
 
 
 def test_sums_do_not_depend_on_where_the_samples_lie_in_memory():
-    """Samples right before or behind the scratch array must not send a loop down another path: same input, same bits."""
+    """The result must be identical wherever the samples are in memory, also right before or after the scratch array."""
     rng = np.random.default_rng(9)
     th = random_surface(SPHERE, rng)
     frame, count = np.zeros(6), 300

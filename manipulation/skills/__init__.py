@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from manipulation.skills.attempt import Attempt
     from manipulation.skills.context import SkillContext
     from manipulation.skills.outcome import ObjectState, SkillReport, Verify
-    from manipulation.skills.perform import perform
+    from manipulation.skills.repeat import perform
     from manipulation.skills.toggle import throw
 
 __all__ = ["Attempt", "ObjectState", "SkillContext", "SkillReport", "Verify", "perform", "throw"]

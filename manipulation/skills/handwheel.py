@@ -17,7 +17,7 @@ from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
-from manipulation.skills.perform import perform
+from manipulation.skills.repeat import perform
 
 HUB_M = 0.009  # generous radius of the hub, which the panel file does not give
 SIDE_M = 0.009  # largest free space between each finger and the rim when approaching

@@ -17,7 +17,7 @@ from manipulation.skills.contact import against_turn, centre_between
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.perform import perform
+from manipulation.skills.repeat import perform
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
 FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long lever arm keeps the load on the pads low

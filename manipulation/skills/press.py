@@ -14,8 +14,8 @@ from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import SOFT_PUSH
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.perform import MAX_ATTEMPTS, perform
 from manipulation.skills.probe import TURNS_RAD
+from manipulation.skills.repeat import MAX_ATTEMPTS, perform
 
 SEEK_N = 2.5  # a light contact ends the fast part of the approach, so that the slow part begins above or on the cap
 SEEK_ABOVE_M = 0.004

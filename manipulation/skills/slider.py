@@ -16,7 +16,7 @@ from manipulation.skills.contact import force_at_rest_n, meet
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
-from manipulation.skills.perform import perform
+from manipulation.skills.repeat import perform
 
 TIP_HEIGHT_M = 0.007  # height of the fingertip above the plate; with a pose error it does not touch the plate
 SIDE_M = 0.009  # free space between fingertip and cap when approaching

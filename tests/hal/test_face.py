@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -53,3 +54,22 @@ def test_a_module_of_the_package_may_be_a_name_of_its_face(folder: Path) -> None
 
 def test_what_the_face_does_not_have_is_an_attribute_error(folder: Path) -> None:
     assert run(folder, "import house; house.roof") == "AttributeError: module 'house' has no attribute 'roof'"
+
+
+FACES = sorted(
+    file.parent
+    for room in ("hal", "perception", "fusion", "manipulation", "simbackend", "drivers", "service")
+    for file in (ROOT / room).rglob("__init__.py")
+    if "load_on_first_use(" in file.read_text(encoding="utf-8")
+)
+
+
+@pytest.mark.parametrize("face", FACES, ids=lambda face: str(face.relative_to(ROOT)))
+def test_no_function_of_a_face_is_called_like_a_module_beside_it(face: Path) -> None:
+    """Importing the module would put it in the function's place."""
+    code = (face / "__init__.py").read_text(encoding="utf-8")
+    taken = {path.stem for path in face.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    imports = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
+    package = ".".join(face.relative_to(ROOT).parts)
+    names = {alias.asname or alias.name for node in imports if node.module != package for alias in node.names}
+    assert not names & taken

@@ -20,8 +20,8 @@ from manipulation.skills.contact import onset
 from manipulation.skills.context import SkillContext
 from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, surely_within, wrapped
-from manipulation.skills.perform import perform
 from manipulation.skills.probe import contact_of
+from manipulation.skills.repeat import perform
 from tests.manipulation.arms import T3
 from tests.manipulation.planning.test_collision import make_panel
 from tests.manipulation.rig import HOME

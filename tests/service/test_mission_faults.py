@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 class Bench:
-    """Run `panelwright serve` on the shipped cell, in separate processes."""
+    """`panelwright serve` on the shipped cell, in separate processes."""
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as probe:

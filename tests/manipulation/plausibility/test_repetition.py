@@ -19,7 +19,7 @@ def wrench(force_n: float) -> np.ndarray:
 
 
 class Wrist(FakeForceTorque):
-    """Return a reading with any noise and rate."""
+    """Force/torque sensor with a given noise and rate."""
 
     def __init__(self, *, force_sigma_n: float = 0.3, rate_hz: float = 500.0) -> None:
         super().__init__("wrist_ft", World())

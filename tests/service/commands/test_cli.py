@@ -147,7 +147,7 @@ def test_init_copies_a_cell_that_doctor_accepts_and_never_overwrites(tmp_path: P
 
 
 class Served:
-    """Run `panelwright serve` in a separate process."""
+    """`panelwright serve` in a separate process."""
 
     def __init__(self, cell: Path, folder: Path) -> None:
         with socket.socket() as probe:

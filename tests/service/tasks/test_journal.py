@@ -143,7 +143,7 @@ def test_who_reads_while_it_is_divided_misses_nothing(tmp_path: Path) -> None:
 
 
 def test_rows_that_could_only_be_copied_are_told_once_and_written_on(tmp_path: Path) -> None:
-    """Set up the state after a crash between the copy and the deletion."""
+    """The rows are as after a crash between the copy and the deletion."""
     journal = Journal(tmp_path / "j.sqlite", part_bytes=SMALL, keep_parts=100)
     with sqlite3.connect(tmp_path / "j.sqlite") as db:
         db.execute("CREATE TRIGGER full BEFORE DELETE ON journal BEGIN SELECT RAISE(ABORT, 'disk full'); END")

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from hal.panel.base import PanelObject
     from hal.panel.button import Button
     from hal.panel.display import Display
+    from hal.panel.families import Rectangular, Round
     from hal.panel.form import Envelope, Face, Relief, Rim, circle
     from hal.panel.gauge import Gauge
     from hal.panel.goals import GAUGE_SHARE, Goal, NumberGoal, Shown, StateGoal
     from hal.panel.handwheel import Handwheel
-    from hal.panel.knob import Knob
     from hal.panel.lamp import Lamp
     from hal.panel.layout import Panel, Tolerances, load_panel
     from hal.panel.lever import Lever
@@ -55,7 +55,6 @@ __all__ = [
     "Gauge",
     "Goal",
     "Handwheel",
-    "Knob",
     "Lamp",
     "Lever",
     "Light",
@@ -68,9 +67,11 @@ __all__ = [
     "PanelObject",
     "Positive",
     "Question",
+    "Rectangular",
     "Relief",
     "Rim",
     "Rotary",
+    "Round",
     "Scale",
     "Shown",
     "Slider",

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-from hal.panel.base import PanelObject
-from hal.panel.form import Envelope, Face
+from hal.panel.families import Round
 from hal.panel.goals import StateGoal
-from hal.panel.parts import LATCHED_SHARE, Name, NotNegative, Positive, Vector2
-from hal.panel.questions import COLOURS, Question, Taught, radius_of
+from hal.panel.parts import LATCHED_SHARE, Name, NotNegative, Positive
+from hal.panel.questions import COLOURS, Question, Taught
 
 
-class Button(PanelObject):
+class Button(Round):
     """Push button; `latching` ones stay in. States `pressed` and `released`."""
 
     kind: Literal["button"] = "button"
-    radius_m: Positive
     height_m: Positive = 0.008
     travel_m: Positive = 0.005
     spring_n_per_m: Positive = 1000.0
@@ -34,20 +32,6 @@ class Button(PanelObject):
     def pressed_depth_m(self) -> float:
         """Depth below the released cap at which it is read as pressed, that is, held down or latched."""
         return LATCHED_SHARE * self.travel_m if self.latching else self.travel_m
-
-    @property
-    def face(self) -> Face:
-        """The cap, in the plane of its top."""
-        return Face(half_width_m=self.radius_m, half_height_m=self.radius_m, height_m=self.height_m)
-
-    @property
-    def half_footprint_m(self) -> Vector2:
-        """Half width and half height, which are its radius."""
-        return self.radius_m, self.radius_m
-
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """Return a box around the cap."""
-        return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
 
     @property
     def goal(self) -> StateGoal:
@@ -73,4 +57,8 @@ class Button(PanelObject):
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
         """Return the keys for radius, colour and whether it latches."""
-        return {**radius_of(taught), "colour": taught.text("colour"), "latching": taught.text("latching") == "yes"}
+        return {
+            **super().keys_of(taught),
+            "colour": taught.text("colour"),
+            "latching": taught.text("latching") == "yes",
+        }

@@ -6,12 +6,10 @@ from typing import Any, ClassVar, Literal
 
 from hal.panel.angles import PointerScale
 from hal.panel.base import PanelObject
+from hal.panel.families import LEAST_HEIGHT_M
 from hal.panel.form import Envelope, Face, Rim, circle
 from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale, radius_of
-
-LEAST_HEIGHT_M = 0.004
-"""Height that is assumed for a flat instrument when collisions with the hand are avoided, in metres."""
 
 
 class Gauge(PanelObject):

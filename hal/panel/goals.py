@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hal.errors import InvalidRequest
+from hal.panel.parts import Scale
 
 GAUGE_SHARE = 0.02
 """Fraction of full scale; a reading or a control with a larger error counts as wrong."""
@@ -69,6 +70,12 @@ class NumberGoal:
     high: float
     unit: str
     tolerance: float
+
+    @classmethod
+    def on(cls, scale: Scale) -> NumberGoal:
+        """Return the goal of a control that may be set to any value of a scale, within 2 % of it."""
+        low, high, tolerance = scale.minimum, scale.maximum, GAUGE_SHARE * scale.span
+        return cls(key="value", low=low, high=high, unit=scale.unit, tolerance=tolerance)
 
     def checked(self, name: str, asked: str | float | None) -> float:
         """Return the requested number.

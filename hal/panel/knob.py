@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal
 
 from hal.panel.angles import PointerScale
-from hal.panel.base import PanelObject
-from hal.panel.form import Envelope, Face, Rim, circle
-from hal.panel.goals import GAUGE_SHARE, NumberGoal
-from hal.panel.parts import Positive, Vector2
-from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale, radius_of
+from hal.panel.families import Round
+from hal.panel.form import Rim, circle
+from hal.panel.goals import NumberGoal
+from hal.panel.parts import Positive
+from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale
 
 
-class Knob(PanelObject):
+class Knob(Round):
     """Knob without detents: a bar on it to take hold of, with a mark that points at a value of the scale around it."""
 
     kind: Literal["knob"] = "knob"
@@ -24,20 +24,6 @@ class Knob(PanelObject):
     asked: ClassVar[tuple[Question, ...]] = about_a_pointer("-135", "135")
 
     @property
-    def face(self) -> Face:
-        """The knob, in the plane of its front."""
-        return Face(half_width_m=self.radius_m, half_height_m=self.radius_m, height_m=self.height_m)
-
-    @property
-    def half_footprint_m(self) -> Vector2:
-        """Half width and half height, which are its radius."""
-        return self.radius_m, self.radius_m
-
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """Return a box around the knob."""
-        return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
-
-    @property
     def rim(self) -> Rim:
         """The knob's shoulder, at half its height."""
         return circle(self.radius_m, above_plate_m=self.height_m / 2)
@@ -45,9 +31,7 @@ class Knob(PanelObject):
     @property
     def goal(self) -> NumberGoal:
         """A number on its scale."""
-        scale = self.scale
-        tolerance = GAUGE_SHARE * scale.span
-        return NumberGoal(key="value", low=scale.minimum, high=scale.maximum, unit=scale.unit, tolerance=tolerance)
+        return NumberGoal.on(self.scale)
 
     @property
     def mission_rank(self) -> float:
@@ -62,4 +46,4 @@ class Knob(PanelObject):
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
         """Return the keys for radius and scale."""
-        return {**radius_of(taught), "scale": pointer_scale(taught)}
+        return {**super().keys_of(taught), "scale": pointer_scale(taught)}

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-from hal.panel.base import PanelObject
-from hal.panel.form import Envelope, Face, Relief
+from hal.panel.families import Round
+from hal.panel.form import Relief
 from hal.panel.goals import StateGoal
-from hal.panel.parts import LATCHED_SHARE, NotNegative, Positive, Vector2
-from hal.panel.questions import Taught, radius_of
+from hal.panel.parts import LATCHED_SHARE, NotNegative, Positive
 
 
-class Mushroom(PanelObject):
+class Mushroom(Round):
     """Emergency mushroom; pressing it latches. States `pressed` and `released`."""
 
     kind: Literal["mushroom"] = "mushroom"
@@ -27,20 +26,6 @@ class Mushroom(PanelObject):
     def pressed_depth_m(self) -> float:
         """Depth of a latched head below a released one."""
         return LATCHED_SHARE * self.travel_m
-
-    @property
-    def face(self) -> Face:
-        """The head, in the plane of its top."""
-        return Face(half_width_m=self.radius_m, half_height_m=self.radius_m, height_m=self.height_m)
-
-    @property
-    def half_footprint_m(self) -> Vector2:
-        """The radius of its head."""
-        return self.radius_m, self.radius_m
-
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """Return a box around the head."""
-        return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
 
     @property
     def goal(self) -> StateGoal:
@@ -63,8 +48,3 @@ class Mushroom(PanelObject):
             high=0.0,
             pressed_depth_m=self.pressed_depth_m,
         )
-
-    @classmethod
-    def keys_of(cls, taught: Taught) -> dict[str, Any]:
-        """Return the key for the radius."""
-        return radius_of(taught)

@@ -10,7 +10,7 @@ from pydantic import ValidationError, model_validator
 from hal.panel.angles import fault
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face
-from hal.panel.goals import GAUGE_SHARE, NumberGoal
+from hal.panel.goals import NumberGoal
 from hal.panel.parts import Positive, Scale, Vector2, Vector3
 from hal.panel.questions import ENDS, Question, Taught, ends_of
 from hal.panel.turn import Angle
@@ -78,9 +78,7 @@ class Slider(PanelObject):
     @property
     def goal(self) -> NumberGoal:
         """A number on its scale."""
-        scale = self.scale
-        tolerance = GAUGE_SHARE * scale.span
-        return NumberGoal(key="value", low=scale.minimum, high=scale.maximum, unit=scale.unit, tolerance=tolerance)
+        return NumberGoal.on(self.scale)
 
     @property
     def mission_rank(self) -> float:

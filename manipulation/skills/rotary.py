@@ -7,14 +7,15 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.errors import InvalidRequest
 from hal.motion import Compliance, Guard, Quantity
-from hal.panel import Knob, Rotary
+from hal.panel import Rotary
+from hal.panel.knob import Knob
 from manipulation.planning.cartesian_path import arc
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import centre_between
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.perform import perform
+from manipulation.skills.repeat import perform
 
 SIDE_M = 0.009
 BAR_RATIO = 0.45  # width of the bar divided by the knob's radius

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hal.panel import Knob
+from hal.panel.knob import Knob
 from hal.simulated import ObjectTruth
 from simbackend.bodies.body import Body, Start, place_of
 from simbackend.bodies.parts import ObjectModel, moving

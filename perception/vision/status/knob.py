@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.panel import Knob
+from hal.panel.knob import Knob
 from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading, gated, probability, refused
 from perception.vision.status.bar import bar_contrast

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hal.panel import Knob, Scale
+from hal.panel import Scale
+from hal.panel.knob import Knob
 from perception.vision.patch import Patch
 from perception.vision.status.knob import read_knob
 

@@ -15,7 +15,7 @@ from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import SOFT_PUSH
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.perform import perform
+from manipulation.skills.repeat import perform
 
 PIVOT_M = 0.004  # the bat turns a little above the plate
 GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a lever arm, low enough not to slip off
@@ -103,14 +103,22 @@ def toggle(
     )
 
 
-def throw(attempt: Attempt, switch: Handle, up: float) -> float:
-    """Approach beside the bat and sweep it over, `up` 1 or -1; returns how far past the pivot the face came, m."""
+def throw(attempt: Attempt, switch: Handle, up: float, *, grip_ratio: float = GRIP_RATIO) -> float:
+    """Approach beside the bat and sweep it over; returns how far past the pivot the fingertip's face came, m.
+
+    Args:
+        up: 1 or -1.
+        grip_ratio: how far up the bat the fingertip pushes, over its length; a flat handle may be pushed near its end.
+
+    Raises:
+        SkillFailure: the bat did not give way, or the fingertip did not come down beside it.
+    """
     half = max(attempt.context.hand.closed_half_m)
     # The bat leans away from the target; come down beyond it.
     lean = switch.bat_length_m * np.sin(switch.tilt_rad) + switch.bat_radius_m
     y = switch.position_m[1]
     start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
-    _come_down(attempt, switch, start, end)
+    _come_down(attempt, switch, start, end, PIVOT_M + grip_ratio * switch.bat_length_m)
     stop_n = stop_force_n(switch)
     moved = _sweep(attempt, end - start, stop_n)
     past = float(moved - (abs(end - start) - BEYOND_M))
@@ -128,19 +136,22 @@ def stop_force_n(switch: Handle) -> float:
     return EFFORT_SPREAD * switch.force_n / GRIP_RATIO + END_N
 
 
-def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float) -> None:
-    """Bring the fingertip beside the bat, at panel height `start_m`, where the sweep to `end_m` is free."""
-    reach = PIVOT_M + GRIP_RATIO * switch.bat_length_m
-    x, above = switch.position_m[0], reach + switch.bat_length_m + STANDOFF_M
+def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float, reach_m: float) -> None:
+    """Bring the fingertip beside the bat, at panel height `start_m`, where the sweep to `end_m` is free.
+
+    Args:
+        reach_m: height of the fingertip above the plate, m.
+    """
+    x, above = switch.position_m[0], reach_m + switch.bat_length_m + STANDOFF_M
     ways = [
-        [panel_from_grip(point, turn) for point in ((x, start_m, above), (x, start_m, reach), (x, end_m, reach))]
+        [panel_from_grip(point, turn) for point in ((x, start_m, above), (x, start_m, reach_m), (x, end_m, reach_m))]
         for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)
     ]
     attempt.begin(ways, may_touch=(switch.name,), width_m=0.0, name=switch.name)
     down = attempt.advance(switch.bat_length_m + STANDOFF_M, name="approach")
     if down.tripped is None:
         return
-    left_m = float((attempt.context.panel_pose.inv() * attempt.pose()).translation[2]) - reach
+    left_m = float((attempt.context.panel_pose.inv() * attempt.pose()).translation[2]) - reach_m
     if left_m > 0.004:
         raise SkillFailure(Outcome.MISSED, "the fingertip landed on something before it was beside the bat")
     attempt.advance(-0.002, name="lift off", speed_m_per_s=0.03)

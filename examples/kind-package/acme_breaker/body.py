@@ -15,16 +15,17 @@ from simbackend.bodies import (
     ObjectModel,
     Start,
     at,
-    cylinder,
+    box,
     moving,
     place_of,
     shape,
-    sphere,
 )
 
 PIVOT_M = 0.004
-WHITE, STEEL = (0.95, 0.95, 0.95), (0.80, 0.81, 0.83)
-HOUSING, WHITE_INK = (40, 41, 44), (235, 235, 235)
+WHITE, BLUE = (0.95, 0.95, 0.95), (0.10, 0.18, 0.45)
+HOUSING, EDGE, RECESS, SCREW, WHITE_INK = (226, 227, 222), (96, 98, 100), (40, 41, 44), (150, 152, 154), (235, 235, 235)
+BORDER_M = 0.003
+"""Width of the housing beside its dark recess."""
 
 
 @dataclass(slots=True, eq=False)
@@ -53,8 +54,8 @@ class BreakerBody(Body[Breaker]):
         """Return the model of the handle with its bright tip."""
         reach, r, tilt = panel_object.bat_length_m, panel_object.bat_radius_m, panel_object.tilt_rad
         parts = [
-            shape(at(0, 0, reach / 2), cylinder(0.7 * r, reach), STEEL),
-            shape(at(0, 0, reach - r), sphere(r), WHITE),
+            shape(at(0, 0, reach / 2 - r), box((2.5 * r, 1.2 * r, reach - 2 * r)), BLUE),
+            shape(at(0, 0, reach - r), box((2.5 * r, 2 * r, 2 * r)), WHITE),
         ]
         urdf = moving(
             parts, kind="revolute", axis=(-1, 0, 0), limits=(-tilt, tilt), mass_kg=0.02, inertia_kg_m2=1e-4,
@@ -71,12 +72,17 @@ class BreakerBody(Body[Breaker]):
         )
 
     def print_on(self, canvas: Canvas, panel_object: Breaker) -> None:
-        """Draw the dark housing, the letters I and O, and the label."""
-        (x, y), half = panel_object.position_m, panel_object.height_m / 2
-        canvas.box((x, y), (panel_object.width_m, panel_object.height_m), HOUSING, round_m=0.001)
-        canvas.text((x, y + 0.8 * half), "I", 0.004, WHITE_INK)
-        canvas.text((x, y - 0.8 * half), "O", 0.004, WHITE_INK)
-        canvas.label((x, y), half, panel_object.label)
+        """Draw the light housing with its terminals, the dark recess that the handle moves in, I and O, and the label."""
+        (x, y), w, h = panel_object.position_m, panel_object.width_m, panel_object.height_m
+        recess_m = (w - 2 * BORDER_M, 0.76 * h)
+        canvas.box((x, y), (w, h), EDGE)
+        canvas.box((x, y), (w - 0.001, h - 0.001), HOUSING)
+        canvas.box((x, y), recess_m, RECESS, round_m=0.001)
+        for end, mark in ((0.44 * h, "I"), (-0.44 * h, "O")):
+            canvas.disc((x, y + end), 0.0024, SCREW)
+            canvas.line((x - 0.0015, y + end - 0.0015), (x + 0.0015, y + end + 0.0015), 0.0006, EDGE)
+            canvas.text((x, y + 0.73 * end), mark, 0.004, WHITE_INK)
+        canvas.label((x, y), h / 2, panel_object.label)
 
     def truth(self, panel_object: Breaker, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
         """Return the true state from the place where the handle rests."""

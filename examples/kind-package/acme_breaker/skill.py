@@ -5,6 +5,9 @@ from __future__ import annotations
 from acme_breaker.model import Breaker
 from manipulation.skills import Attempt, ObjectState, SkillContext, SkillReport, Verify, perform, throw
 
+GRIP_RATIO = 0.7
+"""How far up the handle the fingertip pushes: its flat side holds the finger, and a longer arm needs less force."""
+
 
 def breaker(
     context: SkillContext,
@@ -23,8 +26,8 @@ def breaker(
 
     def stroke(attempt: Attempt) -> float:
         if target == "on" and (current is None or current.state != "off"):
-            throw(attempt, panel_object, -1.0)
-        return throw(attempt, panel_object, 1.0 if target == "on" else -1.0)
+            throw(attempt, panel_object, -1.0, grip_ratio=GRIP_RATIO)
+        return throw(attempt, panel_object, 1.0 if target == "on" else -1.0, grip_ratio=GRIP_RATIO)
 
     return perform(
         context,

@@ -2,6 +2,9 @@
 
     python -m benchmarks.manipulation [--skills lever,slider,...] [--seeds 20] [--first 1] [--error-mm 3]
     [--error-deg 1]
+    python -m benchmarks.manipulation --skills knob,breaker --panel examples/kind-package/panel.toml
+
+The second needs the package in `examples/kind-package` to be installed.
 
 Success is judged by the simulator's truth after the skill has ended, not by the skill's report. A `done` that the truth
 does not confirm counts as false.
@@ -13,16 +16,19 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from benchmarks.simcell import SimBench, open_bench
 from hal.errors import CellError
+from hal.panel.knob import Knob
 from manipulation.skills.outcome import ObjectState, Outcome, SkillReport
 from manipulation.skills.retreat import park
 
 ANGLE_SIGMA_RAD = np.radians(1.0)  # noise of the readings that the skills receive
+KNOB_SIGMA_RAD = np.radians(0.8)
 SLIDER_SIGMA = 0.4  # percent of the scale: 0.4 mm
 SLIDER_TOLERANCE_M = 0.0015
 LEVER_TOLERANCE_RAD = np.radians(5.0)
@@ -36,6 +42,8 @@ PEAK_N = {
     "rotary": 40.0,
     "lever": 98.0,
     "handwheel": 83.0,
+    "knob": 40.0,
+    "breaker": 40.0,
 }
 
 
@@ -126,6 +134,31 @@ def _mushroom(bench: SimBench) -> Judged:
     return report, bench.truth("emergency").state == "pressed", 0.0
 
 
+def _knob(bench: SimBench) -> Judged:
+    knob = bench.context.panel.object("speed")
+    assert isinstance(knob, Knob)
+    scale = knob.scale
+    goal = scale.minimum + float(bench.rng.uniform(0.1, 0.9)) * scale.span
+    sigma = KNOB_SIGMA_RAD * scale.span / abs(scale.at_max - scale.at_min)
+
+    def look() -> ObjectState:
+        return replace(bench.look("speed", value_sigma=sigma), sigma=sigma)
+
+    report = bench.operate("speed", goal, current=look(), verify=look)
+    error = float(bench.truth("speed").value or 0.0) - goal
+    return report, abs(error) <= knob.goal.tolerance, error
+
+
+def _breaker(bench: SimBench) -> Judged:
+    goal = {"on": "off", "off": "on", "tripped": "on"}[str(bench.truth("feed").state)]
+
+    def look() -> ObjectState:
+        return bench.look("feed")
+
+    report = bench.operate("feed", goal, current=look(), verify=look)
+    return report, bench.truth("feed").state == goal, 0.0
+
+
 SKILLS: dict[str, Callable[[SimBench], Judged]] = {
     "lever": _lever,
     "slider": _slider,
@@ -135,13 +168,15 @@ SKILLS: dict[str, Callable[[SimBench], Judged]] = {
     "handwheel": _handwheel,
     "mushroom": _mushroom,
 }
+OTHERS: dict[str, Callable[[SimBench], Judged]] = {"knob": _knob, "breaker": _breaker}
+"""Skills of kinds that the bench panel does not have."""
 
 
 def trial(bench: SimBench, skill: str, seed: int) -> Trial:
     """Execute one skill and judge it."""
     wall, sim = time.perf_counter(), bench.clock.now_s()
     try:
-        report, is_right, error = SKILLS[skill](bench)
+        report, is_right, error = (SKILLS | OTHERS)[skill](bench)
         outcome, cause = str(report.outcome), report.cause
         attempts, peak = report.attempts, report.peak_force_n
     except CellError as fault:
@@ -197,12 +232,15 @@ def main() -> None:
     parser.add_argument("--skills", default=",".join(SKILLS))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--panel", type=Path, help="a panel file other than the bench cell's")
     parser.add_argument("--error-mm", type=float, default=3.0)
     parser.add_argument("--error-deg", type=float, default=1.0)
     options = parser.parse_args()
     trials: list[Trial] = []
     for seed in range(options.first, options.first + options.seeds):
-        bench = open_bench(seed, error_m=options.error_mm * 1e-3, error_rad=np.radians(options.error_deg))
+        bench = open_bench(
+            seed, error_m=options.error_mm * 1e-3, error_rad=np.radians(options.error_deg), panel=options.panel
+        )
         try:
             for skill in options.skills.split(","):
                 result = trial(bench, skill, seed)

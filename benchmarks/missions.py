@@ -1,7 +1,7 @@
-"""Runs and judges whole missions over seeds: `python -m benchmarks.missions [FIRST LAST] [--cell FILE]`.
+"""Runs and judges whole missions: `python -m benchmarks.missions [FIRST LAST] [--cell FILE] [--panel FILE]`.
 
-Every mission runs through the real server, as by `panelwright demo --seed N --judge`. Prints a table and the pass
-lines.
+Every mission runs through the real server, as by `panelwright demo --seed N --judge`. Prints a table of missions, one of
+kinds (readings and actions that were right, wrong, refused or not confirmed) and the pass lines.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+import tomllib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from benchmarks.cell import clear_stop, run_to_end
 from hal.arrays import Array
@@ -78,21 +81,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("first", type=int, nargs="?", default=1)
     parser.add_argument("last", type=int, nargs="?", default=20)
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
+    parser.add_argument("--panel", type=Path, help="a panel file other than the cell's own")
     given = parser.parse_args(arguments)
     if given.last < given.first:
         parser.error(f"the seeds {given.first} to {given.last} are none: FIRST comes before LAST")
     print(f"{HEAD}\n|{' --- |' * 12}", flush=True)
     runs = []
     for seed in range(given.first, given.last + 1):
-        runs.append(run(seed, given.cell))
+        runs.append(run(seed, given.cell, given.panel))
         print(runs[-1].row(), flush=True)
+    print(by_kind(runs))
     return summary(runs)
 
 
-def run(seed: int, cell: Path) -> Run:
+def run(seed: int, cell: Path, panel: Path | None = None) -> Run:
     """Run and judge one mission in a new service."""
     with tempfile.TemporaryDirectory() as folder:
-        loaded = load_cell(cell, seed=seed)
+        loaded = load_cell(cell if panel is None else with_panel(cell, panel, Path(folder)), seed=seed)
         panelwright = Panelwright(loaded, Options(port=0, runs_dir=Path(folder)))
         panelwright.start()
         try:
@@ -105,6 +110,40 @@ def run(seed: int, cell: Path) -> Run:
             panelwright.close()
         report = json.loads((Path(folder) / name / "report.json").read_text(encoding="utf-8"))
         return Run(seed=seed, report=report, places_m=built_places(loaded, seed))
+
+
+def with_panel(cell: Path, panel: Path, folder: Path) -> Path:
+    """Write a cell file that has another panel, into `folder`, and return its path."""
+    loaded = load_cell(cell)
+    table = tomllib.loads(cell.read_text(encoding="utf-8"))
+    table["cell"] |= {
+        "panel": str(panel.resolve()),
+        "calibrations": str(loaded.calibration_path("any").parent.resolve()),
+    }
+    if loaded.knowledge_path is not None:
+        table["cell"]["knowledge"] = str(loaded.knowledge_path.resolve())
+    path = folder / "cell.toml"
+    path.write_text(tomlkit.dumps(table), encoding="utf-8")
+    return path
+
+
+def by_kind(runs: Sequence[Run]) -> str:
+    """A table of all runs' readings and actions by the kind of the object, as the judge has them."""
+    counts: dict[str, Counter[str]] = {}
+    for each in runs:
+        kinds = {reading["name"]: reading["kind"] for reading in each.report["readings"]}
+        for reading in each.report["readings"]:
+            refused = reading["reason"] is not None or not reading["present"]
+            counts.setdefault(reading["kind"], Counter())["read, refused"] += refused
+        for claim in each.judge["claims"]:
+            did = "worked" if "reached" in claim else "read"
+            counts[kinds[claim["name"]]][f"{did}, {'right' if claim['right'] else 'wrong'}"] += 1
+        for action in each.report["actions"]:
+            counts[kinds[action["object"]]]["worked, not confirmed"] += not action["confirmed"]
+    columns = [f"read, {how}" for how in ("right", "wrong", "refused")]
+    columns += [f"worked, {how}" for how in ("right", "wrong", "not confirmed")]
+    rows = [f"| {kind} | {' | '.join(str(n[column]) for column in columns)} |" for kind, n in sorted(counts.items())]
+    return "\n".join([f"| kind | {' | '.join(columns)} |", f"|{' --- |' * (len(columns) + 1)}", *rows])
 
 
 def built_places(cell: Cell, seed: int) -> dict[str, Array]:

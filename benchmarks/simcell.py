@@ -17,6 +17,7 @@ from hal.clock import SimClock
 from hal.config import Cell, load_cell
 from hal.devices import DeviceKind
 from hal.geometry import UncertainPose, perturbed
+from hal.panel import load_panel
 from hal.registry import Context, Shared, connect
 from hal.simulated import ObjectTruth
 from manipulation.control.controller import Controller
@@ -91,9 +92,16 @@ def open_bench(
     error_rad: float = np.radians(1.0),
     speed: float = 0.25,
     progress: Callable[[float, str], None] = _silent,
+    panel: Path | None = None,
 ) -> SimBench:
-    """Open the bench of a seed with a panel pose that is wrong by `error_m` and `error_rad` in a random direction."""
+    """Open the bench of a seed with a panel pose that is wrong by `error_m` and `error_rad` in a random direction.
+
+    Args:
+        panel: a panel file other than the cell's own.
+    """
     file = load_cell(ROOT / "cells" / "bench.toml", seed=seed)
+    if panel is not None:
+        file = file.model_copy(update={"panel": load_panel(panel)})
     clock, shared = SimClock(), Shared()
     made: dict[str, Any] = {}
     for name, section in file.file.devices.items():

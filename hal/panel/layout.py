@@ -6,8 +6,10 @@ import json
 import math
 from contextlib import suppress
 from difflib import get_close_matches
+from functools import reduce
+from operator import getitem
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, GetJsonSchemaHandler, TypeAdapter, ValidationError, ValidationInfo, model_validator
 from pydantic_core import CoreSchema, core_schema
@@ -18,8 +20,10 @@ from hal.panel.angles import UNITLESS, Location, again, fault, in_radians
 from hal.panel.base import PanelObject
 from hal.panel.parts import Light, Name, NotNegative, Positive
 from hal.panel.plate import faults_of
-from hal.panel.turn import meant_otherwise
+from hal.panel.turn import TURN_RAD, meant_otherwise
 from hal.strict import Strict, load_toml, reachable
+
+T = TypeVar("T")
 
 
 class _OfItsKind:
@@ -102,7 +106,7 @@ class Panel(Strict):
             table = data.get(key)
             for k, one in enumerate(table if isinstance(table, list) else ()):
                 with suppress(ValidationError):
-                    parts[(key, k)] = model.validate_json(json.dumps(one, default=str))
+                    parts[(key, k)] = _as_meant(one, model)
         width, height = data.get("width_m"), data.get("height_m")
         if not isinstance(width, float) or not isinstance(height, float):
             width = height = math.inf
@@ -124,6 +128,27 @@ class Panel(Strict):
             f"no object called {name!r} on panel {self.name!r}",
             hint=f"did you mean {near[0]!r}?" if near else f"objects: {', '.join(names)}",
         )
+
+
+def _as_meant(table: Any, model: TypeAdapter[T]) -> T:
+    """Return a part of a panel; read once more without unknown keys and with too large angles as degrees if need be.
+
+    Raises:
+        ValidationError: the part has other faults.
+    """
+    try:
+        return model.validate_json(json.dumps(table, default=str))
+    except ValidationError as error:
+        meant = json.loads(json.dumps(table, default=str))
+        for item in error.errors():
+            *above, key = item["loc"]
+            with suppress(KeyError, IndexError, TypeError):  # the fault is in something that is not in the table
+                inner = reduce(getitem, above, meant)
+                if item["type"] == "extra_forbidden":
+                    del inner[key]
+                elif abs(inner[key]) > TURN_RAD:
+                    inner[key] = math.radians(inner[key])
+        return model.validate_json(json.dumps(meant))
 
 
 def load_panel(path: Path) -> Panel:

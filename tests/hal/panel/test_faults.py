@@ -110,6 +110,16 @@ def test_all_faults_are_told_at_once() -> None:
         assert sum(says in one for one in found) == 1, (says, found)
 
 
+def test_parts_whose_angles_or_keys_are_wrong_still_have_their_place() -> None:
+    found = faults(
+        GAUGE + SCALE % "at_min = -135.0, at_max = 135.0",
+        'kind = "lamp"\nname = "run"\nposition_m = [0.02, 0.0]\nradius_m = 0.01\ncolor = "red"',
+        'kind = "lamp"\nname = "off"\nposition_m = [0.02, 0.01]\nradius_m = "10 mm"',
+    )
+    assert sum("mm in pressure" in one for one in found) == 1, found
+    assert not any("off" in one and "mm in" in one for one in found), "its size is not known"
+
+
 def test_the_shipped_panels_can_be_meant() -> None:
     paths = sorted((Path(__file__).parents[3] / "panels").glob("*.toml"))
     assert paths

@@ -1,4 +1,4 @@
-"""Compiled kinematics of the arm, on plain arrays.
+"""Compiled kinematics of the arm on plain arrays.
 
 `dh`: (n, 4) rows (d, a, alpha, offset) of a standard Denavit-Hartenberg chain, m and rad. Matrices are 4x4 homogeneous.
 The tests compare each kernel with a numpy implementation.

@@ -76,7 +76,7 @@ class ControlThread:
         try:
             while not self._is_closing:
                 self._turn()
-        except Exception:  # raised by `beat`: it is no longer known what holds the arm
+        except Exception:  # raised by `beat`; the state of the arm is not known any more
             log.exception("the control thread ends")
         with self._gate:
             self._is_closing = True

@@ -72,6 +72,6 @@ class Drives:
             self._clock.sleep(self.dt_s)
             return
         now_s = self._clock.now_s()
-        # After a late tick the periods are counted anew, because catching up would bunch set-points.
+        # After a late tick the periods are counted from now, because catching up would send several set-points at once.
         self._next_tick_s = max(self._next_tick_s + self.dt_s, now_s)
         self._clock.sleep(self._next_tick_s - now_s)

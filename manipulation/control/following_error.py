@@ -1,4 +1,4 @@
-"""Checks that the arm stands where it reports: a wrong position would make it jump with its next set-point."""
+"""Checks the arm's reported position, because a wrong one would make the arm jump with the next set-point."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from manipulation.plausibility.arm import does_not_follow
 
 
 class FollowingErrorMonitor:
-    """Compares the position that an arm reports with the one that its drives hold, before anything moves.
+    """Compares the position that an arm reports with the position of its drives, before anything moves.
 
     Args:
         arm: its name in the cell file.
@@ -29,7 +29,7 @@ class FollowingErrorMonitor:
         self._is_doubted = False  # from a failure until the arm accepts a set-point at its reported position
 
     def check_held(self, measured_rad: Array, held: SetPointLimiter) -> None:
-        """Refuse to begin when the arm reports a position far from where its drives hold it: it would jump there.
+        """Refuse to begin if the arm reports a position far from that of its drives, because it would jump.
 
         Args:
             measured_rad: (n,) joints that the arm reports.

@@ -74,7 +74,7 @@ class DeviceFailure(Exception):
 
 
 def refuse(finding: Finding | None) -> None:
-    """End the motion if there is a finding, that is, if a device is not to be believed.
+    """End the motion if there is a finding, that is, if a device is not plausible.
 
     Raises:
         DeviceFailure: there is a finding; carries its cause.
@@ -228,10 +228,10 @@ class Devices:
 
 
 def failure_of(device: str, error: Exception) -> DeviceFailure:
-    """Return the failure that stands for an error, named after the device in the error if it gives one.
+    """Return the failure for an error, with the name of the device in the error if it has one.
 
-    A device may stand for others, so the error's own name goes first. A defect of a driver counts as a failure of its
-    device, because it must end a motion as gently as a loose cable does.
+    The name in the error takes precedence, because a device may represent others. A defect of a driver counts as a failure
+    of its device, because it must end a motion as gently as a loose cable does.
     """
     if not isinstance(error, CellError):
         log.error("%s: its driver failed", device, exc_info=error)

@@ -1,4 +1,4 @@
-"""Time parameterization: a joint path becomes a trajectory within the limits of joints and tip.
+"""Converts a joint path to a trajectory within the limits of joints and tip.
 
 The path q(s) is sampled on a grid with rounded corners. Then the speed ds/dt is made as high as the limits allow by one
 pass forwards and one backwards over the samples.

@@ -21,7 +21,7 @@ OFF_SIGMA = 6.0  # standard deviations of one reading
 class ProximityMonitor:
     """Finds a sensor whose readings over the touched plate are off by the same amount at two places in a row.
 
-    One place alone proves nothing, because a cable may hang before the plate there.
+    A single place is not sufficient, because a cable may hang in front of the plate there.
     """
 
     def __init__(self, panel: Panel) -> None:

@@ -45,7 +45,7 @@ def repeated_frame(device: str, before: Frame | None, newest: Frame) -> Finding 
 class RepeatedWrench:
     """Finds a force/torque sensor that repeats one reading, with which no guard would ever see a contact.
 
-    A sensor that states no noise is believed, because it may well repeat itself.
+    A sensor without specified noise is not checked, because it may repeat readings.
     """
 
     def __init__(self, sensor: ForceTorque | None) -> None:

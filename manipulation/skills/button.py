@@ -1,4 +1,4 @@
-"""Press a push button."""
+"""Presses a push button."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def button(
 ) -> SkillReport:
     """Press the button once, but not if the expected state was already seen, because a press would undo it.
 
-    A button that springs back and works no lamp shows nothing afterwards, so its outcome is `unverified`.
+    A button that springs back and switches no lamp shows nothing afterwards, so its outcome is `unverified`.
 
     Args:
         expected: the state that the read-back must show afterwards: `pressed` or `released` of a latching button, or

@@ -1,6 +1,6 @@
 """Guarded moves until contact.
 
-The pads give way under load, so the place of first contact is computed from the rise of the force.
+The pads are compressed under load, so the place of first contact is computed from the rise of the force.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Turn a handwheel: hold its rim lightly between two spokes and carry it round the hub."""
+"""Turns a handwheel: holds its rim lightly between two spokes and carries it about the hub."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turn a knob to a value of its scale: hold its bar lightly and turn about its axis."""
+"""Turns a knob to a value of its scale: holds its bar lightly and turns about its axis."""
 
 from __future__ import annotations
 

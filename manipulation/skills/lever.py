@@ -1,4 +1,4 @@
-"""Turn a lever valve: enclose the bar between the fingers without squeezing it, and carry it round its hub."""
+"""Turns a lever valve: encloses the bar between the fingers without squeezing it, and carries it about its hub."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.repeat import perform
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
-FROM_END_M = 0.008  # the fingers hold the bar this far before its end: a long lever arm keeps the load on the pads low
+FROM_END_M = 0.008  # distance of the fingers from the end of the bar; a long lever arm keeps the load on the pads low
 APPROACH_SIDE_M = 0.010  # free space on each side when approaching; more than the pose error
 CAGE_SIDE_M = 0.002  # free space on each side in the stroke: the bar is enclosed, not squeezed
 STROKE_M_PER_S = 0.08
@@ -33,7 +33,7 @@ SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
 EFFORT_SPREAD = 1.6
 EFFORT_FLOOR_N = 35.0
-LARGEST_STOP_N = 92.0  # below the cell's protective limit, to tell a stiff valve from a collision
+LARGEST_STOP_N = 92.0  # below the cell's protective limit, to distinguish a stiff valve from a collision
 MOVED_RAD = np.radians(12.0)
 TOLERANCE_RAD = np.radians(8.0)
 INF = float("inf")
@@ -72,8 +72,8 @@ def lever(
     The mechanical estimate in the report is the angle reached, rad clockwise from up.
 
     Args:
-        current: what the last observation showed; its angle tells where the fingers come down. Without it `verify` is
-            asked.
+        current: what the last observation showed; its angle determines where the fingers come down. Without it
+            `verify` is called.
         verify: the caller's read-back.
 
     Raises:
@@ -161,8 +161,8 @@ def _hub(attempt: Attempt, valve: Lever, angle_rad: float) -> Array:
 def _carry(attempt: Attempt, valve: Lever, turn: _Turn, hub: Array) -> float:
     """Make the stroke in two parts: fast to 9 degrees before the end, then slowly onto the end stop.
 
-    Returns the signed angle by which the bar turned: the turn of the tool less the play of the cage and the give of the
-    pads.
+    Returns the signed angle by which the bar turned: the angle of the tool minus the play between fingers and bar and
+    the compression of the pads.
     """
     context, span_rad = attempt.context, turn.span_rad
     sign = float(np.sign(span_rad))

@@ -1,4 +1,4 @@
-"""Press an emergency mushroom button, which latches."""
+"""Presses an emergency mushroom button, which latches."""
 
 from __future__ import annotations
 

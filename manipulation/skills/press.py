@@ -37,7 +37,7 @@ def press(
     verify: Verify | None,
     is_there: bool = False,
 ) -> SkillReport:
-    """Press a cap down to its stop and let go.
+    """Press a cap down to its stop and release it.
 
     The mechanical estimate is the travel of the cap in metres.
 
@@ -91,7 +91,7 @@ def _push(attempt: Attempt, cap: Button | Mushroom) -> MotionReport:
 
 
 def travelled_m(report: MotionReport, pad_stiffness_n_per_m: float) -> float:
-    """Return how far the cap moved, m: tip travel under force, less the give of the pads."""
+    """Return how far the cap moved, m: the tip's travel under force minus the compression of the pads."""
     axis = report.base_from_tool.rotation.apply([0.0, 0.0, 1.0])
     depth, force = report.log.tip_m @ axis, -report.log.wrench[:, 2]
     loaded = np.flatnonzero(force > 1.0)

@@ -1,4 +1,4 @@
-"""Probing the panel: touch points with the closed fingers, and proximity points with the sensors beside them."""
+"""Probes the panel: touch points with the closed fingers, and proximity points with the sensors beside them."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def touch_probe(
 def contact_of(report: MotionReport, *, finger_half_m: tuple[float, float]) -> TouchPoint:
     """Return the point of first contact of a guarded approach along the fingers.
 
-    The pads give way, so the tip is past the surface when the guard trips. The force rises linearly with the depth, and
-    the straight line through the samples above the sensor's noise is zero at the surface.
+    The pads are compressed, so the tip is past the surface when the guard trips. The force rises linearly with the depth,
+    and the straight line through the samples above the sensor's noise is zero at the surface.
     """
     axis = report.base_from_tool.rotation.apply([0.0, 0.0, 1.0])
     depth = report.log.tip_m @ axis

@@ -1,4 +1,4 @@
-"""Retreat: open the hand, move back along the fingers, and go to the parking joints."""
+"""Retreats: opens the hand, moves back along the fingers, and goes to the parking joints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def retreat(context: SkillContext, attempt: Attempt | None = None, *, distance_m
     attempt = attempt or Attempt(context)
     width = min(context.hand.max_width_m, context.mover.state().gripper_width_m + 0.02)
     with suppress(SkillFailure, MotionRefused):
-        # A gripper with an implausible reading does not end the retreat: the pull shows whether it has let go.
+        # A gripper with an implausible reading does not end the retreat; the pull shows whether the hand is free.
         attempt.run(
             GripperMotion(name="let go", width_m=width, force_n=LET_GO_N, speed_m_per_s=PADS_M_PER_S, must_arrive=False)
         )

@@ -1,4 +1,4 @@
-"""Turn a rotary selector: hold its bar lightly and turn about the knob's axis."""
+"""Turns a rotary selector: holds its bar lightly and turns about the knob's axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Move a slider: feel a face of its cap with the finger and push it by the missing distance."""
+"""Moves a slider: locates a face of its cap by touch and pushes it by the missing distance."""
 
 from __future__ import annotations
 
@@ -159,6 +159,6 @@ def _go(attempt: Attempt, fader: Slider, ahead: np.ndarray, distance_m: float, n
 
 
 def _give_m(attempt: Attempt, ahead: np.ndarray) -> float:
-    """Return how far the pads yield under the force that friction holds at rest, m."""
+    """Return the compression of the pads under the force that friction maintains at rest, m."""
     force = max(0.0, force_at_rest_n(attempt, attempt.pose().rotation.inv().apply(-ahead)))
     return force / attempt.context.hand.pad_stiffness_n_per_m

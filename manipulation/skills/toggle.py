@@ -1,4 +1,4 @@
-"""Throw a toggle switch: sweep the closed fingertip across the bat until it snaps over."""
+"""Throws a toggle switch: sweeps the closed fingertip across the bat until it snaps over."""
 
 from __future__ import annotations
 

@@ -121,5 +121,7 @@ def _verdict(verdict: dict[str, Any]) -> str:
         inside = "inside" if verdict["inside_95"] else "outside"
         pose = f"pose off by {error_mm:.2f} mm and {error_deg:.2f} deg, {inside} its 95 % ellipsoid"
     right = f"{verdict['readings_right']} of {verdict['readings_given']} readings right"
-    moved = "".join(f"; [red]{m['name']} moved unasked, {m['truth']}[/]" for m in verdict["moved_unasked"])
+    moved = "".join(
+        f"; [red]{m['name']} changed without being operated, {m['truth']}[/]" for m in verdict["moved_unasked"]
+    )
     return f"judge: [{style}]{words}[/]; {right}; {pose}{moved}"

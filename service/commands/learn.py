@@ -23,7 +23,7 @@ def learn(
     ),
     url: ServiceUrl = None,
 ) -> None:
-    """Locate the panel and learn from one overview what its objects look like, without a click.
+    """Locate the panel and learn from one overview what its objects look like, without clicks.
 
     Run it again when an object looks different (a lamp is lit, a lever is open); only new looks are added.
     """

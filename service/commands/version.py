@@ -23,4 +23,4 @@ def root(
         bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show)
     ] = False,
 ) -> None:
-    """A robot cell that inspects and works industrial control panels."""
+    """A robot cell that inspects and operates industrial control panels."""

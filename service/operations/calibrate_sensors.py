@@ -85,7 +85,11 @@ def measure_camera(session: Session, camera: str, count: int, known: Beforehand)
     views = visit(session, flanges, measure, count=count, name="look")
     session.progress(0.92, "solve")
     result = calibrate_in_hand(views, _lights_m(session), _nominal(session, camera), known)
-    _check_scatter(result.chi_square, result.degrees, "the panel file's light positions, the lens, and for reflections")
+    _check_scatter(
+        result.chi_square,
+        result.degrees,
+        "the panel file's light positions, the lens, and whether there are reflections",
+    )
     return result
 
 
@@ -149,7 +153,7 @@ def measure_scanner(session: Session, scanner: str, count: int) -> ScannerCalibr
     views = visit(session, flanges, measure, count=count, name="scan")
     session.progress(0.92, "solve")
     result = calibrate_scanner(views, session.mount(scanner).parent_from_child, session.known_panel())
-    _check_scatter(result.chi_square, result.degrees, "the plate: is it flat, and is nothing in front of it?")
+    _check_scatter(result.chi_square, result.degrees, "that the plate is flat and that nothing is in front of it")
     return result
 
 
@@ -215,7 +219,7 @@ def order(
     free = [candidates[k] for k in reachable(session, candidates)]
     if len(free) < count:
         raise Unreachable(
-            f"the arm reaches {len(free)} of {len(candidates)} stations before the panel, {count} are wanted",
+            f"the arm reaches {len(free)} of {len(candidates)} stations in front of the panel, but {count} are wanted",
             hint="ask for fewer poses, or put the panel where the arm can look at it from several sides",
         )
     chosen: list[RigidTransform] = []
@@ -247,7 +251,7 @@ def visit(
             return found
     raise Unreachable(
         f"only {len(found)} of {count} stations could be measured from; {why or 'no other is left'}",
-        hint="ask for fewer poses, or give the arm more room before the panel",
+        hint="ask for fewer poses, or give the arm more space in front of the panel",
     )
 
 

@@ -243,7 +243,7 @@ def need_all_present(found: Inspection, session: Session) -> None:
     if lost:
         raise NotFound(
             f"{', '.join(lost)} {'is' if len(lost) == 1 else 'are'} not where the file of panel {session.panel.name!r} says",
-            hint="is this the right panel file? is something in the way? see the annotated picture",
+            hint="check the panel file, and that nothing hides the objects: see the annotated picture",
             objects=list(lost),
         )
 

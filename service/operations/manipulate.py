@@ -149,7 +149,7 @@ class _Eye:
             return None  # an inconclusive read-back makes the outcome `unverified`
         self.picture = Picture(
             name=f"after-{self._panel_object.name}",
-            title=f"second look at {self.witness.name}",
+            title=f"read-back of {self.witness.name}",
             png=png_of(found.pictures[-1].pixels),
         )
         reading = found.readings[self.witness.name]

@@ -158,7 +158,7 @@ def follow(session: Session, plan: TouchPlan, touches: int) -> Felt:
     if len(accounts) < LEAST_TOUCHES and skipped and not plan.offers:
         raise NotFound(
             f"only {len(accounts)} of {touches} places of the plate could be touched: {'; '.join(skipped)}",
-            hint="is the panel where the lights say? is something in the way?",
+            hint="check that the panel has not moved since it was located, and that nothing is in the way",
         )
     account = TouchingResult(touches=accounts, skipped=skipped, ended=ended)
     return Felt(observations=tuple(observations), account=account)

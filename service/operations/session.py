@@ -197,7 +197,9 @@ class Session:
         """
         pose = self.world.base_from_panel
         if pose is None:
-            raise NotFound("the panel has not been located yet", hint="POST /v1/panel-pose first, or send a pose along")
+            raise NotFound(
+                "the panel has not been located yet", hint="POST /v1/panel-pose first, or send a pose with the request"
+            )
         return pose
 
     def believed_panel(self) -> UncertainPose:

@@ -78,7 +78,7 @@ class CellRuntime:
             swapped: device sections that replace those of the cell file, for example from before a restart.
             runs_dir: folder in which `panelwright calibrate` keeps its records. Motion uses these; the devices use the
                 records of the cell file.
-            partial: whether to go on without devices that do not connect; an invalid cell file is refused in any case.
+            partial: whether to continue without devices that do not connect; an invalid cell file is refused in any case.
             report: called when an isolated driver stops or restarts, and for each device that is `MISSING`.
 
         Raises:
@@ -214,7 +214,7 @@ def gathered(failed: Mapping[str, CellError], *, total: int, cell: Cell) -> Cell
     kind: type[CellError] = ConfigError if is_config else DevicesUnavailable
     return kind(
         f"{len(errors)} of the {total} devices in {cell.path} did not connect",
-        hint="mend each; `panelwright doctor` tries them again",
+        hint="correct each of them; `panelwright doctor` tests them again",
         **{name: f"{error.what} (try: {error.hint})" for name, error in failed.items()},
     )
 

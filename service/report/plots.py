@@ -59,7 +59,7 @@ def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     left.set_title("range, m", fontsize=9, color=INK)
     figure.colorbar(shown, ax=left, shrink=0.85)
     shown = right.imshow(1e3 * residual_m, cmap="coolwarm", vmin=-40, vmax=40)
-    right.set_title("in front of the fitted panel plane (blue), mm", fontsize=9, color=INK)
+    right.set_title("distance from the fitted plane, mm (blue: in front of it)", fontsize=9, color=INK)
     figure.colorbar(shown, ax=right, shrink=0.85)
     for pane in (left, right):
         pane.set_axis_off()
@@ -82,12 +82,12 @@ def stations_picture(
             room.plot(*np.array([place, tip]).T[[0, 2, 1]], color=colour, lw=1.6)
         room.text(place[0], place[2], place[1], f" {k}", fontsize=7, color=SOFT)
     room.set_xlabel("x, m", fontsize=7, color=SOFT)
-    room.set_ylabel("before the plate, m", fontsize=7, color=SOFT)
+    room.set_ylabel("distance from the plate, m", fontsize=7, color=SOFT)
     room.set_zlabel("y, m", fontsize=7, color=SOFT)
     room.tick_params(labelsize=6, colors=SOFT)
     room.set_aspect("equal")
     room.view_init(elev=22, azim=58)
-    room.set_title("stations of the camera, its view in blue", fontsize=9, color=INK)
+    room.set_title("stations of the camera, lines of sight in blue", fontsize=9, color=INK)
     miss = figure.add_subplot(1, 2, 2)
     for k, one in enumerate(residuals_px):
         miss.plot(*one.T, "o", ms=3.5, color=f"C{k % 10}", alpha=0.8)
@@ -99,7 +99,7 @@ def stations_picture(
     miss.set_aspect("equal", adjustable="datalim")
     miss.set_xlabel("px", fontsize=8, color=SOFT)
     miss.tick_params(labelsize=7, colors=SOFT)
-    miss.set_title(f"lights against the fit, rms {rms:.3f} px", fontsize=9, color=INK)
+    miss.set_title(f"residuals of the lights, rms {rms:.3f} px", fontsize=9, color=INK)
     return figure_png(figure)
 
 
@@ -116,7 +116,7 @@ def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
             force.annotate(motion.name, (motion.started_s, motion.peak_force_n), fontsize=6, color=SOFT, rotation=30)
     force.set_ylabel("contact force, N")
     torque.set_ylabel("torque, N m")
-    torque.set_xlabel("s on the cell's clock")
+    torque.set_xlabel("cell time, s")
     force.legend(ncols=3, fontsize=7, frameon=False, loc="upper left")
     return _finished(figure, (force, torque))
 
@@ -129,7 +129,7 @@ def joints_picture(motions: Sequence[MotionReport]) -> bytes:
     for k in range(joints.shape[1]):
         pane.plot(times, joints[:, k], lw=0.9, label=f"joint {k + 1}")
     pane.set_ylabel("rad")
-    pane.set_xlabel("s on the cell's clock")
+    pane.set_xlabel("cell time, s")
     pane.legend(ncols=6, fontsize=7, frameon=False)
     return _finished(figure, (pane,))
 

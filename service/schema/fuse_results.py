@@ -173,7 +173,7 @@ def _warnings(fused: FusedPose) -> list[str]:
         return []
     return [
         f"the measurements agree far better than their covariances say (chi-square {fused.chi_square:.2g} with {fused.dof} "
-        "degrees of freedom): are these in m^2, not in mm^2, and of one reading?"
+        "degrees of freedom): check that they are in m^2 and not in mm^2, and that they describe single readings"
     ]
 
 

@@ -64,7 +64,7 @@ def test_what_devices_share_is_said_once_and_faults_of_their_own_by_name(write_c
     own: dict[str, CellError] = {name: DeviceUnavailable("no answer", hint="plug it in") for name in ("arm", "gripper")}
     all_of_them = gathered(own, total=4, cell=cell)
     assert set(all_of_them.details) == {"arm", "gripper"}
-    assert (all_of_them.hint.startswith("mend each"), all_of_them.retry) == (True, "after-fix")
+    assert (all_of_them.hint.startswith("correct each"), all_of_them.retry) == (True, "after-fix")
 
 
 @pytest.mark.parametrize(("options", "key"), [("unit = 900", ".unit"), ("unit = 3", "")], ids=["one", "all together"])

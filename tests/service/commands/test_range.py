@@ -199,5 +199,5 @@ def test_ctrl_c_keeps_what_is_done_and_ends_calmly(tmp_path: Path) -> None:
         said = process.communicate()[0]
     assert process.returncode == 130, said
     done = part.read_text().count("\n") - 1
-    assert f"stopped: {done} of 2000 recordings done" in said and "the same command goes on" in said
+    assert f"stopped: {done} of 2000 recordings done" in said and "run the same command to continue" in said
     assert 20 <= done < 2000 and "Traceback" not in said and "WARNING" not in said

@@ -72,7 +72,7 @@ def test_an_address_is_taken_as_curl_takes_it(served: Panelwright) -> None:
 
 @pytest.mark.parametrize("url", ["ftp://localhost:8460", "http://localhost:none", "http://", ""])
 def test_what_is_no_address_is_refused(url: str) -> None:
-    with pytest.raises(ConfigError, match="no address"):
+    with pytest.raises(ConfigError, match="not the address"):
         Client(url=url).get("/readyz")
 
 

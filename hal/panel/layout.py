@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from functools import reduce
 from operator import getitem
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, GetJsonSchemaHandler, TypeAdapter, ValidationError, ValidationInfo, model_validator
 from pydantic_core import CoreSchema, core_schema
@@ -22,8 +22,6 @@ from hal.panel.parts import Light, Name, NotNegative, Positive
 from hal.panel.plate import faults_of
 from hal.panel.turn import TURN_RAD, meant_otherwise
 from hal.strict import Strict, load_toml, reachable
-
-T = TypeVar("T")
 
 
 class _OfItsKind:
@@ -66,7 +64,7 @@ def _of_its_kind(data: Any, info: ValidationInfo) -> PanelObject:
 
 
 AnyObject = Annotated[PanelObject, _OfItsKind]
-_OBJECT: TypeAdapter[PanelObject] = TypeAdapter(AnyObject)
+_PARTS: dict[str, TypeAdapter[Any]] = {"lights": TypeAdapter(Light), "objects": TypeAdapter(AnyObject)}
 
 
 class Tolerances(Strict):
@@ -102,7 +100,7 @@ class Panel(Strict):
     def further_faults(cls, data: dict[str, Any]) -> list[Any]:
         """Return faults in the layout of the parts that are valid by themselves, although other parts are not."""
         parts: dict[Location, Light | PanelObject] = {}
-        for key, model in (("lights", TypeAdapter(Light)), ("objects", _OBJECT)):
+        for key, model in _PARTS.items():
             table = data.get(key)
             for k, one in enumerate(table if isinstance(table, list) else ()):
                 with suppress(ValidationError):
@@ -130,7 +128,7 @@ class Panel(Strict):
         )
 
 
-def _as_meant(table: Any, model: TypeAdapter[T]) -> T:
+def _as_meant(table: Any, model: TypeAdapter[Any]) -> Any:
     """Return a part of a panel; read once more without unknown keys and with too large angles as degrees if need be.
 
     Raises:

@@ -102,7 +102,7 @@ def stranger() -> Iterator[str]:
 
 
 def test_another_program_on_that_port_is_refused(stranger: str) -> None:
-    with pytest.raises(ConfigError, match="no panelwright"):
+    with pytest.raises(ConfigError, match="another program answers"):
         Client(url=stranger).get("/v1/devices")
 
 

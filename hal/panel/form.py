@@ -23,6 +23,8 @@ class Rim:
     """Edge that is visible in every state: a circle of half the width, or a rectangle, at a height above the plate.
 
     Attributes:
+        above_sigma_m: one standard deviation of `above_plate_m`, for an edge that is the object's foot in one view and its
+            shoulder in another.
         reach_m: distance inside or outside of it within which a parallel edge of the same object may be stronger.
     """
 
@@ -30,13 +32,20 @@ class Rim:
     width_m: float
     height_m: float
     above_plate_m: float = 0.0
+    above_sigma_m: float = 0.0
     reach_m: float = 0.0
 
 
-def circle(radius_m: float, *, above_plate_m: float = 0.0, reach_m: float = 0.0) -> Rim:
+def circle(radius_m: float, *, above_plate_m: float = 0.0, above_sigma_m: float = 0.0, reach_m: float = 0.0) -> Rim:
     """Return a round rim."""
-    size = 2.0 * radius_m
-    return Rim(shape="circle", width_m=size, height_m=size, above_plate_m=above_plate_m, reach_m=reach_m)
+    return Rim(
+        shape="circle",
+        width_m=2.0 * radius_m,
+        height_m=2.0 * radius_m,
+        above_plate_m=above_plate_m,
+        above_sigma_m=above_sigma_m,
+        reach_m=reach_m,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, Literal
 
 from hal.panel.angles import PointerScale
@@ -25,8 +26,8 @@ class Knob(Round):
 
     @property
     def rim(self) -> Rim:
-        """The knob's shoulder, at half its height."""
-        return circle(self.radius_m, above_plate_m=self.height_m / 2)
+        """The knob's shoulder, at half its height; what is seen lies anywhere from its foot to its front."""
+        return circle(self.radius_m, above_plate_m=self.height_m / 2, above_sigma_m=self.height_m / math.sqrt(12.0))
 
     @property
     def goal(self) -> NumberGoal:

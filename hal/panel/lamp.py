@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, Literal
 
 from hal.panel.families import Round
@@ -23,8 +24,8 @@ class Lamp(Round):
 
     @property
     def rim(self) -> Rim:
-        """The foot of the lens."""
-        return circle(self.radius_m)
+        """The foot of the lens; what is seen lies anywhere from there to its front."""
+        return circle(self.radius_m, above_sigma_m=self.height_m / math.sqrt(3.0))
 
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from perception.vision.quadrangle import QuadranglePose, estimate
     from perception.vision.reading import ObjectReading, answer_at
     from perception.vision.registration.outline import contour_m
+    from perception.vision.registration.rims import RimView, find_rims
     from perception.vision.warm import warm_up
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "PanelProjection",
     "PhotographKind",
     "QuadranglePose",
+    "RimView",
     "TaughtKind",
     "answer_at",
     "as_gray",
@@ -47,6 +49,7 @@ __all__ = [
     "estimate",
     "find_panel",
     "find_panel_lights",
+    "find_rims",
     "inspect",
     "inspect_view",
     "kind_files",

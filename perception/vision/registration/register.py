@@ -99,7 +99,7 @@ def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
     found = _look(smooth, slope_noise, moved, everything, LAST_LOOK_PX)
     near = found.ok & (np.abs(found.offset_px) <= NEAR_PX)
     built_m = panel.tolerances.position_m
-    local = {name: _object_fit(smooth, slope_noise, moved, edges, built_m) for name, edges in own.items()}
+    local = {name: fit_object(image, moved, edges, built_m) for name, edges in own.items()}
     return Registration(
         view=moved,
         covariance=covariance,
@@ -216,9 +216,7 @@ def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
     return out
 
 
-def _object_fit(
-    smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, built_m: float
-) -> ObjectFit:
+def fit_object(image: EdgeImage, view: PanelProjection, edges: Outline, built_m: float) -> ObjectFit:
     """Fit the displacement of an object to its own edges.
 
     `built_m` is the standard deviation of the object's position on the plate. The edges of an object have a common
@@ -227,7 +225,7 @@ def _object_fit(
     scale_px_per_m = float(np.nanmedian(np.linalg.norm(_ahead(view, edges), axis=1))) / NORMAL_STEP_M
     reach_px = edges.reach_m * scale_px_per_m
     prior_px = float(np.hypot(REGISTERED_SIGMA_PX, built_m * scale_px_per_m))
-    found = _look(smooth, slope_noise, view, edges, float(np.clip(1.5 + reach_px, 4.0, 9.0)))
+    found = _look(image.smooth, image.slope_noise, view, edges, float(np.clip(1.5 + reach_px, 4.0, 9.0)))
     visible = int(found.visible.sum())
     if found.ok.sum() < 6:
         share = 0.0 if visible >= 6 else float("nan")

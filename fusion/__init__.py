@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
     from fusion.shared_errors import FusedObservations, error_budget, fuse_observations
     from fusion.solve import solve_from_many
+    from fusion.triangulation import PanelDepth, TriangulatedPoint, depth_before, triangulate, with_common_errors
     from fusion.warm import warm_up
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "Measurement",
     "MovingPart",
     "Observation",
+    "PanelDepth",
     "PixelObservation",
     "PlaneObservation",
     "PoseTolerance",
@@ -53,12 +55,16 @@ __all__ = [
     "ShapeEstimate",
     "TouchObservation",
     "TouchPlan",
+    "TriangulatedPoint",
+    "depth_before",
     "error_budget",
     "fuse",
     "fuse_observations",
     "solve_from_many",
+    "triangulate",
     "unit",
     "warm_up",
+    "with_common_errors",
 ]
 if not TYPE_CHECKING:
     __getattr__ = load_on_first_use(__name__, __file__)

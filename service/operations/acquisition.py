@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CameraIntrinsics
 from hal.clock import Deadline, WallClock
@@ -42,6 +43,7 @@ class Look:
     stamp_s: float
     camera: str
     intrinsics: CameraIntrinsics
+    base_from_flange: RigidTransform
     base_from_camera: UncertainPose
 
 
@@ -114,12 +116,14 @@ def look(session: Session, camera: str | None = None) -> Look:
     sample = device.read_image(deadline=deadline())
     pixels = sample.usable(now_s=asked_s, max_age_s=OLDEST_S, device=name).pixels
     _refuse_frozen(session, name, sample, pixels)
+    flange = session.connection.mover.state().base_from_flange
     return Look(
         pixels=pixels,
         stamp_s=sample.host_time_s,
         camera=name,
         intrinsics=session.lens(name),
-        base_from_camera=base_from(session, name),
+        base_from_flange=flange,
+        base_from_camera=frame_tree(session.cell, flange).base_from(name),
     )
 
 

@@ -32,10 +32,11 @@ MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the ligh
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AnnotatedView:
-    """One image for people: RGB, uint8 (H, W, 3), with the readings drawn in."""
+    """One image for people: RGB, uint8 (H, W, 3), with the readings drawn in; and the image that it was made from."""
 
     title: str
     pixels: NDArray[np.uint8]
+    look: Look
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,7 +71,7 @@ def inspect_here(
         look(session, view.camera)  # raises if the camera is frozen, which a second identical frame shows
         raise
     session.world.note_readings(readings)
-    picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings))
+    picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings), look=view)
     return Inspection(readings={r.name: r for r in readings}, pictures=(picture,))
 
 

@@ -1,20 +1,32 @@
-"""Locates the panel: its pose from the four border lights, and the plane of its plate from a range image."""
+"""Locates the panel by its border lights, its plate by a range image, and its objects' rims by several images."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fusion import PixelObservation, PlaneObservation
+from fusion import PixelObservation, PlaneObservation, depth_before, triangulate, with_common_errors
 from hal.arrays import Array
-from hal.errors import NotFound
+from hal.errors import NotFound, PerceptionError
 from hal.geometry import UncertainPose, compose, matrix_of
+from hal.panel import PanelObject, Rim
 from perception.range import PinholeSensor, PlaneFit, fit_plane_near
-from perception.vision import AssignedLights, PanelPrior, QuadranglePose, find_panel, find_panel_lights, viewpoints
+from perception.vision import (
+    AssignedLights,
+    PanelPrior,
+    QuadranglePose,
+    RimView,
+    find_panel,
+    find_panel_lights,
+    find_rims,
+    viewpoints,
+)
 from service.operations.acquisition import LightPair, Look, Scan, look_with_lights, scan
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
+from service.schema.mission_results import ObjectDepth
 from service.schema.requests import PanelPoseRequest
 from service.schema.results import PanelPoseResult, PlateInScanner, estimated
 from service.world_model import expected_panel
@@ -155,6 +167,86 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
     return ScannedPlane(fit=fit, scan=image, observation=observation)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenRim:
+    """The rim of an object in one image; the covariance of `ray` is that of the image alone."""
+
+    view: RimView
+    ray: PixelObservation
+
+
+def rims_in(session: Session, looks: Iterable[Look]) -> tuple[SeenRim, ...]:
+    """Find the rims of the panel's objects in images that were taken for reading them."""
+    panel = session.known_panel()
+    return tuple(
+        SeenRim(
+            view=view,
+            ray=PixelObservation(
+                sensor=look.camera,
+                base_from_flange=look.base_from_flange,
+                name=view.name,
+                point_m=view.point_m,
+                pixel_px=view.pixel_px,
+                covariance_px=view.covariance_px,
+                intrinsics=look.intrinsics,
+            ),
+        )
+        for look in looks
+        for view in find_rims(
+            look.pixels, look.intrinsics, compose(look.base_from_camera.inverse(), panel), session.panel
+        )
+    )
+
+
+def rim_observations(rims: Sequence[SeenRim]) -> tuple[PixelObservation, ...]:
+    """Return rays to the rims' places in the panel file, for fusing the panel's pose."""
+    return with_common_errors([rim.ray for rim in rims], [rim.view.built_covariance_px for rim in rims])
+
+
+def object_depths(session: Session, rims: Sequence[SeenRim]) -> list[ObjectDepth]:
+    """Compare how far each object with a rim stands out of the plate with what the panel file says."""
+    return [
+        _depth_of(session, one, one.rim, [rim.ray for rim in rims if rim.view.name == one.name])
+        for one in session.panel.objects
+        if one.rim is not None
+    ]
+
+
+def _depth_of(session: Session, panel_object: PanelObject, rim: Rim, rays: Sequence[PixelObservation]) -> ObjectDepth:
+    mounts = {ray.sensor: session.mount(ray.sensor) for ray in rays}
+    stated_m = rim.above_plate_m
+    answer = ObjectDepth(
+        name=panel_object.name,
+        kind=panel_object.kind,
+        views=len(rays),
+        stated_m=stated_m,
+        finding="not measured: fewer than two images show its rim",
+    )
+    if len(rays) < 2:
+        return answer
+    try:
+        point = triangulate(rays, mounts, lenses=session.one_sigma_lenses())
+    except PerceptionError as error:
+        return answer.model_copy(update={"finding": f"not measured: {error.what}"})
+    depth = depth_before(session.known_panel(), point, expected_m=stated_m, expected_sigma_m=rim.above_sigma_m)
+    finding = f"its rim stands {1e3 * depth.depth_m:.1f} mm out of the plate (1 sigma {1e3 * depth.sigma_m:.1f} mm)"
+    if depth.contradicts:
+        finding = (
+            f"{panel_object.name}: {finding}, and {1e3 * stated_m:.1f} mm by the panel file: is it loose, or"
+            " mounted otherwise than the file has it?"
+        )
+    return answer.model_copy(
+        update={
+            "parallax_rad": point.parallax_rad,
+            "depth_m": depth.depth_m,
+            "sigma_m": depth.sigma_m,
+            "chi_square": depth.chi_square,
+            "contradicts": depth.contradicts,
+            "finding": finding,
+        }
+    )
+
+
 def run_panel_pose(session: Session, request: PanelPoseRequest) -> PanelPoseResult:
     """Run the verb `panel-pose`."""
     if request.move:
@@ -180,11 +272,10 @@ def run_panel_pose(session: Session, request: PanelPoseRequest) -> PanelPoseResu
 def _light_observations(
     session: Session, look: Look, pixels: Array, covariances: Array
 ) -> tuple[PixelObservation, ...]:
-    flange = session.mover.state().base_from_flange
     return tuple(
         PixelObservation(
             sensor=look.camera,
-            base_from_flange=flange,
+            base_from_flange=look.base_from_flange,
             name=light.name,
             point_m=np.array(light.position_m),
             pixel_px=pixel,

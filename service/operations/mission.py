@@ -19,7 +19,17 @@ from perception.vision import ObjectReading
 from service.operations.acquisition import settle
 from service.operations.evaluate import AFTER
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
-from service.operations.locate import Located, ScannedPlane, go_to_overview, locate, scan_plate
+from service.operations.locate import (
+    Located,
+    ScannedPlane,
+    SeenRim,
+    go_to_overview,
+    locate,
+    object_depths,
+    rim_observations,
+    rims_in,
+    scan_plate,
+)
 from service.operations.manipulate import work
 from service.operations.range_detection import OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.sense import feel, fuse_and_remember, fused_result, light_observations
@@ -83,6 +93,7 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         report=f"/v1/missions/{name}/report.html" if is_reported else None,
         actions=record.actions,
         fused=record.fused,
+        depths=record.depths or [],
         cell_s=sum(step.cell_s for step in record.steps),
         wall_s=sum(step.wall_s for step in record.steps),
     )
@@ -119,23 +130,26 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
     with _step(session, "recognise", 0.19, 0.22) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # until the border lights are out
-        found = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
-        _note_pictures(record, found, "recognised")
-        need_all_present(found, session)
-        record.objects = _places(session, found)
+        overview = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
+        _note_pictures(record, overview, "recognised")
+        need_all_present(overview, session)
+        record.objects = _places(session, overview)
     with _step(session, "read", 0.22, 0.38) as part:
         found = inspect_close(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, found, "read")
         record.readings += [reading_result(reading, BEFORE) for reading in found.readings.values()]
+        rims = rims_in(part, [view.look for view in (*overview.pictures, *found.pictures)])
     with _step(session, "touch", 0.38, 0.55) as part:
-        known: tuple[Observation, ...] = (*light_observations([first, located]), plane.observation)
+        rays = (*light_observations([first, located]), *rim_observations(rims))
+        known: tuple[Observation, ...] = (*rays, plane.observation)
         felt = feel(part, request.touches, known, request.wanted.tolerance())
     with _step(session, "fuse", 0.55, 0.57) as part:
-        part.progress(0.0, "fuse light rays, range plane, distances and touches")
+        part.progress(0.0, "fuse rays to lights and rims, range plane, distances and touches")
         answer = fuse_and_remember(part, (*known, *felt.observations))
         record.fused = fused_result(answer, felt)
         record.by_lights = estimated(located.base_from_panel)
         record.pictures.append(_drawing(session, located))
+        _note_depths(part, record, rims)
     with _step(session, "check by surfaces", 0.57, 0.58) as part:
         part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
         checks, pictures = check_surfaces(part, by_surfaces)
@@ -239,6 +253,13 @@ def _note_plane(record: MissionRecord, plane: ScannedPlane) -> None:
         normal=feature.direction.tolist(),
         rms_m=float(np.sqrt(np.trace(feature.point_covariance))),
     )
+
+
+def _note_depths(session: Session, record: MissionRecord, rims: Sequence[SeenRim]) -> None:
+    record.depths = object_depths(session, rims)
+    wrong = [depth.finding for depth in record.depths if depth.contradicts]
+    if wrong:
+        session.progress(1.0, "the panel file contradicts the camera", "; ".join(wrong))
 
 
 def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:

@@ -11,11 +11,11 @@ from typing import Any
 from hal.errors import CellError
 from hal.motion import MotionReport
 from service.schema.fuse_results import FuseResult
-from service.schema.mission_results import ActionResult, ObjectPlace, ReadingResult, SurfaceCheck
+from service.schema.mission_results import ActionResult, ObjectDepth, ObjectPlace, ReadingResult, SurfaceCheck
 from service.schema.results import EstimatedPose, FittedPlate
 
 # Fields of a record that appear in a report once they are known.
-FINDINGS = ("plate_in_scanner", "objects", "fused", "by_lights", "by_surfaces", "not_parked")
+FINDINGS = ("plate_in_scanner", "objects", "fused", "by_lights", "by_surfaces", "depths", "not_parked")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +48,7 @@ class MissionRecord:
         objects: the position of each object in 3-D.
         fused, by_lights: the panel's pose from all sensors, and from its lights alone.
         by_surfaces: results from the objects' surfaces, in addition to layout and vision.
+        depths: how far the objects stand out of the plate by several camera views, beside the panel file.
         not_parked: why the arm was not parked after an error.
     """
 
@@ -68,6 +69,7 @@ class MissionRecord:
     fused: FuseResult | None = None
     by_lights: EstimatedPose | None = None
     by_surfaces: list[SurfaceCheck] | None = None
+    depths: list[ObjectDepth] | None = None
     not_parked: str | None = None
     problem: dict[str, Any] | None = None
     started_cell_s: float = field(init=False)

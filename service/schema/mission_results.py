@@ -46,14 +46,42 @@ class ManipulateResult(Result):
     pictures: Pictures
 
 
+class ObjectDepth(Result):
+    """Distance of an object's rim from the plate by two or more images, in comparison with the panel file.
+
+    Attributes:
+        views: how many images show its rim; `parallax_rad` is the largest angle between two lines of sight.
+        depth_m: of the middle of the rim, along the panel's normal, with the standard deviation `sigma_m`; null if it could
+            not be measured. `stated_m` is the value of the panel file.
+        chi_square: of the difference, with one degree of freedom.
+        contradicts: whether such a difference arises by chance in less than one case of 10,000.
+        finding: the result as a sentence.
+    """
+
+    name: str
+    kind: str
+    views: int
+    parallax_rad: float | None = None
+    depth_m: float | None = None
+    sigma_m: float | None = None
+    stated_m: float
+    chi_square: float | None = None
+    contradicts: bool = False
+    finding: str
+
+
 class MissionResult(Result):
-    """The result of a mission; `report` is the address of its report, null when it could not be written."""
+    """The result of a mission; `report` is the address of its report, null when it could not be written.
+
+    `depths` compares the objects' depths with the panel file; an entry that `contradicts` is a warning.
+    """
 
     mission: str
     succeeded: bool
     report: str | None
     actions: list[ActionResult]
     fused: FuseResult | None
+    depths: list[ObjectDepth]
     cell_s: float
     wall_s: float
 

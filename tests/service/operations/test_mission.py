@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from hal.config import load_cell
 from hal.errors import CellError, DeviceFault, NotFound
 from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
+from service.operations.acquisition import look, settle
 from service.operations.evaluate import evaluate
 from service.operations.inspect import look_close
-from service.operations.locate import go_to_overview, locate, scan_plate
+from service.operations.locate import go_to_overview, locate, object_depths, rims_in, scan_plate
 from service.operations.mission import run_mission
 from service.operations.range_detection import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.session import OperationContext, Session
@@ -78,6 +80,15 @@ def lie(truth: Truth) -> Truth:
     return replace(truth, base_from_panel_matrix=matrix, objects=wrong, initial=wrong)
 
 
+def with_wheel(session: Session, **changes: object) -> Session:
+    """The session with another description of the wheel in its panel file."""
+    connection = copy(session.context.connection)
+    objects = tuple(one.model_copy(update=changes) if one.name == "bypass" else one for one in session.panel.objects)
+    panel = session.panel.model_copy(update={"objects": objects})
+    connection.cell = session.cell.model_copy(update={"panel": panel})
+    return Session(context=replace(session.context, connection=connection))
+
+
 def stand_close(session: Session) -> None:
     """Drive to where an action ends, at the close-up of a control."""
     go_to_overview(session)
@@ -104,6 +115,12 @@ def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path)
     assert set(checks) == {"bypass", "emergency"}
     assert all(c["found"] and c["agrees"] and c["off_m"] < 0.004 for c in checks.values())
     assert checks["emergency"]["shows"] == "released"
+    depths = {depth["name"]: depth for depth in honest["depths"]}
+    assert {"current", "temperature", "run_lamp", "bypass", "mode"} <= set(depths)
+    measured = [depth for depth in depths.values() if depth["depth_m"] is not None]
+    assert len(measured) >= 6 and not any(depth["contradicts"] for depth in measured)
+    assert depths["bypass"]["depth_m"] == pytest.approx(0.025, abs=4.0 * depths["bypass"]["sigma_m"])
+    assert depths["bypass"]["views"] >= 3 and depths["bypass"]["sigma_m"] < 0.0015
     pictures = [path.name for path in (tmp_path / "honest/runs").glob("*/*.png")]
     assert {"lights.png", "range.png", "surfaces.png", "pose.png", "wrench.png", "joints.png"} <= set(pictures)
 
@@ -117,6 +134,17 @@ def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_
         stood = session.mover.state().position_rad
         checks, pictures = check_surfaces(session, first)
         moved = np.abs(session.mover.state().position_rad - stood).max()
+        go_to_overview(session)
+        settle(session)
+        looks = [look(session)]
+        for place in ("flow", "mode"):
+            looks += [view.look for view in look_close(session, session.panel.object(place).point_m, [place]).pictures]
+        wheel_in_file = session.panel.object("bypass")
+        built_m = (wheel_in_file.position_m[0] + 0.008, wheel_in_file.position_m[1])
+        by_file, by_wrong_file = [
+            {depth.name: depth for depth in object_depths(at, rims_in(at, looks))}
+            for at in (with_wheel(session, position_m=built_m), with_wheel(session, position_m=built_m, height_m=0.018))
+        ]
     by_name = {check.name: check for check in checks}
     assert by_name["emergency"].agrees and by_name["emergency"].seen_from == OVERVIEW
     wheel = by_name["bypass"]
@@ -125,6 +153,10 @@ def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_
     assert [picture.name for picture in pictures] == ["surfaces", "surfaces-bypass"]
     with pytest.raises(NotFound, match="bypass is not operated"):
         need_its_place(checks, "bypass")
+    assert not by_file["bypass"].contradicts and by_wrong_file["bypass"].contradicts
+    assert "bypass: its rim stands" in by_wrong_file["bypass"].finding
+    assert by_wrong_file["bypass"].depth_m == pytest.approx(by_file["bypass"].depth_m, abs=0.003)
+    assert not any(depth.contradicts for name, depth in by_wrong_file.items() if name != "bypass")
 
 
 @pytest.mark.parametrize("device", ["wrist_camera", "range_scanner"])

@@ -29,6 +29,8 @@ class PanelObject(Strict, ABC):
     """Whether a value of the object is an angle in radians rather than a value of a scale."""
     is_round: ClassVar[bool] = False
     """Whether its outline is drawn as a circle where it has no `rim`."""
+    can_be_lit: ClassVar[bool] = False
+    """Whether a button may light it."""
     asked: ClassVar[tuple[Question, ...]] = ()
     """Questions that teaching a panel with such an object must ask, in addition to its name."""
     places_are_lengths: ClassVar[bool] = False

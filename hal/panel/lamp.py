@@ -18,6 +18,7 @@ class Lamp(Round):
     colour: Literal["red", "green", "amber", "blue", "white"] = "green"
     height_m: NotNegative = 0.006
 
+    can_be_lit: ClassVar[bool] = True
     asked: ClassVar[tuple[Question, ...]] = (
         Question(key="colour", text="Which colour?", choices=COLOURS, default="green"),
     )

@@ -77,7 +77,7 @@ def _overlapping(parts: Parts) -> Iterator[InitErrorDetails]:
 
 
 def _without_lamp(parts: Parts) -> Iterator[InitErrorDetails]:
-    lamps = {part.name for part in parts.values() if isinstance(part, PanelObject) and part.kind == "lamp"}
+    lamps = {part.name for part in parts.values() if isinstance(part, PanelObject) and part.can_be_lit}
     for at, part in parts.items():
         lit = getattr(part, "lights_lamp", None)
         if lit is not None and lit not in lamps:

@@ -7,7 +7,9 @@ cannot be simulated.
 
 from __future__ import annotations
 
+import inspect
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hal.entry_points import load, near_or_all, registered
@@ -47,6 +49,15 @@ def kind_model(kind: str) -> type[PanelObject]:
             hint="give the entry point and the `kind` of its model the same name",
         )
     return model
+
+
+def home_of(kind: str) -> Path:
+    """Return the folder of a kind's model: a package keeps there, under `knowledge`, what its kind looks like.
+
+    Raises:
+        ConfigError: no such kind, or its package does not import.
+    """
+    return Path(inspect.getfile(kind_model(kind))).parent
 
 
 def has_part(group: str, kind: str) -> bool:

@@ -16,12 +16,14 @@ from pydantic import Field, model_validator
 from hal.arrays import Array
 from hal.atomic_write import write_atomically
 from hal.errors import ConfigError
+from hal.panel.kinds import home_of, installed_kinds
 from hal.strict import Strict, load_toml
 from hal.toml_text import toml_text
 from perception.vision.knowledge import Knowledge, TaughtKind, spread_of
 from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 
-SHIPPED = Path(__file__).parent / "knowledge"
+FOLDER = "knowledge"
+SHIPPED = Path(__file__).parent / FOLDER
 OTHER_FILES = frozenset({"proportions"})  # of a knowledge folder, which are not kinds
 UNIT = 100.0  # looks are stored in hundredths
 REPAIR = "restore it, or delete it and teach the kind again"
@@ -92,21 +94,23 @@ def load_knowledge(folder: Path | None = None) -> Knowledge:
 
 
 def kind_files(folder: Path | None = None) -> list[Path]:
-    """Return the files of a folder's kinds, by name; those that come with the package if none is given.
+    """Return the files of a folder's kinds, by name; if none is given, those that come with the installed packages.
+
+    A package that adds a kind keeps the file in the folder `knowledge` beside its model.
 
     Raises:
         ConfigError: a kind has two files.
     """
     found: dict[str, Path] = {}
-    folder = SHIPPED if folder is None else folder
-    for path in sorted([*folder.glob("*.toml"), *folder.glob("*.npz")]):
+    folders = (
+        [folder] if folder is not None else [SHIPPED, *sorted({home_of(kind) / FOLDER for kind in installed_kinds()})]
+    )
+    for path in [path for each in folders for suffix in ("npz", "toml") for path in sorted(each.glob(f"*.{suffix}"))]:
         if path.stem in OTHER_FILES:
             continue
         if path.stem in found:
-            raise ConfigError(
-                f"kind {path.stem!r} has two files in {folder}", hint=f"keep {path.name} or {found[path.stem].name}",
-                file=str(path),
-            )  # fmt: skip
+            what = f"kind {path.stem!r} has two files, {found[path.stem]} and {path}"
+            raise ConfigError(what, hint="keep one of them", file=str(path))
         found[path.stem] = path
     return [found[name] for name in sorted(found)]
 

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -57,6 +58,35 @@ def test_an_installed_kind_is_found_by_its_name_in_all_four_tables(installed: di
 def test_a_breaker_that_has_tripped_holds_on_only_after_off(installed: dict[str, str]) -> None:
     ran = subprocess.run([sys.executable, "-c", PROBE], env=installed, check=True, capture_output=True, text=True)
     assert json.loads(ran.stdout)["rests"] == [0.0, -0.45, 0.45]
+
+
+@pytest.fixture(scope="module")
+def mission(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Return what a judged mission on the package's panel said; in the world of this seed the breaker has tripped."""
+    script, folder = ROOT / "tests/examples/breaker_mission.py", tmp_path_factory.mktemp("mission")
+    command = [sys.executable, str(script), str(folder), "305"]
+    ran = subprocess.run(command, env=installed, check=True, capture_output=True, text=True)
+    said: dict[str, Any] = json.loads(ran.stdout)
+    return said
+
+
+@pytest.mark.slow
+def test_a_mission_reads_a_tripped_breaker_and_throws_it_on(mission: dict[str, Any]) -> None:
+    assert mission["readings"]["feed, before the actions"] == "tripped"
+    assert mission["readings"]["feed, after the actions"] == "on"
+    assert ["feed", "breaker to on", True] in mission["claims"] and mission["agrees"]
+
+
+@pytest.mark.slow
+def test_the_mission_reads_the_counter_and_turns_the_knob_beside_it(mission: dict[str, Any]) -> None:
+    assert all(is_right for _, _, is_right in mission["claims"])
+    done = {(name, what.split(" to ")[0]) for name, what, _ in mission["claims"]}
+    assert done >= {("hours", "read before the actions"), ("speed", "read after the actions"), ("speed", "knob")}
+
+
+@pytest.mark.slow
+def test_the_package_brings_what_its_kind_looks_like(mission: dict[str, Any]) -> None:
+    assert mission["kinds"].count("breaker") == 1
 
 
 def test_without_its_package_the_kind_is_refused() -> None:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from perception.range.analysis import RangeScene, analyse
     from perception.range.batch import batch_range, recordings_in
     from perception.range.batch_results import BatchResult, KeptResults
+    from perception.range.matching.cross_check import PlaceCheck, check_place, outline_px, states_agree
     from perception.range.matching.match import Match, match_models
     from perception.range.matching.models import load_models, shipped_models
     from perception.range.matching.panel_objects import PanelView, Sighting, find_objects
@@ -32,6 +33,7 @@ __all__ = [
     "OrthographicSensor",
     "PanelView",
     "PinholeSensor",
+    "PlaceCheck",
     "Plane",
     "PlaneFit",
     "RangeScene",
@@ -43,6 +45,7 @@ __all__ = [
     "analyse",
     "assumptions",
     "batch_range",
+    "check_place",
     "find_objects",
     "fit_plane_near",
     "image_from_sweep",
@@ -50,10 +53,12 @@ __all__ = [
     "load_recording",
     "match_json",
     "match_models",
+    "outline_px",
     "picture",
     "recordings_in",
     "scene_json",
     "shipped_models",
+    "states_agree",
     "warm_up",
     "write_ply",
     "write_png",

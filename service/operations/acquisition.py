@@ -23,7 +23,7 @@ from hal.geometry import UncertainPose
 from hal.motion import Hold, MotionOutcome
 from hal.readings import Cause, Quality, Stamped
 from manipulation import plan_sweep, plausibility
-from perception.range import image_from_sweep
+from perception.range import PinholeSensor, image_from_sweep
 from service.operations.session import Session
 from service.operations.travel import kinematics, skill_context
 
@@ -64,6 +64,17 @@ class Scan:
     scanner: str
     capabilities: RangeScannerCapabilities
     base_from_scanner: UncertainPose
+
+    def pinhole(self) -> PinholeSensor:
+        """Return the scanner's model.
+
+        Raises:
+            Unsupported: the image is not a pinhole projection.
+        """
+        c = self.capabilities
+        if c.projection != "pinhole":
+            raise Unsupported(f"{self.scanner} has {c.projection} projection", hint="use a pinhole range scanner")
+        return PinholeSensor(width_px=c.width, height_px=c.height, fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

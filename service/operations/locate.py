@@ -12,7 +12,7 @@ from hal.arrays import Array
 from hal.errors import NotFound, PerceptionError
 from hal.geometry import UncertainPose, compose, matrix_of
 from hal.panel import PanelObject, Rim
-from perception.range import PinholeSensor, PlaneFit, fit_plane_near
+from perception.range import PlaneFit, fit_plane_near
 from perception.vision import (
     AssignedLights,
     PanelPrior,
@@ -149,7 +149,7 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
     sigma = np.sqrt(np.diag(scanner_from_panel.covariance))
     fit = fit_plane_near(
         image.depth_m,
-        PinholeSensor(width_px=c.width, height_px=c.height, fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy),
+        image.pinhole(),
         point_m=pose.translation,
         normal=pose.rotation.apply([0.0, 0.0, 1.0]),
         sigma_offset_m=float(max(sigma[:3].max(), 0.005)),

@@ -11,14 +11,22 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
-from scipy.special import chdtri
 
 from hal.devices import DeviceKind
-from hal.errors import NotFound, PerceptionError, Unreachable, Unsupported
-from hal.geometry import UncertainPose, compose
+from hal.errors import NotFound, PerceptionError, Unreachable
+from hal.geometry import UncertainPose
 from hal.panel import Panel, PanelObject
-from perception.range import PanelView, PinholeSensor, RangeScene, Sighting, Surface, analyse, find_objects
+from perception.range import (
+    PanelView,
+    RangeScene,
+    Sighting,
+    Surface,
+    analyse,
+    check_place,
+    find_objects,
+    outline_px,
+    states_agree,
+)
 from perception.vision import ObjectReading, viewpoints
 from service.operations.acquisition import Scan, settle
 from service.operations.locate import ScannedPlane, scan_plate
@@ -29,9 +37,6 @@ from service.report.record import Picture
 from service.report.surfaces import Mark, surfaces_picture
 from service.schema.mission_results import SurfaceCheck
 
-OUTLINE_POINTS = 48  # points of the circle that is drawn around an object
-ELSEWHERE_P = 1e-3  # probability that an object in its right place is scanned twice
-TURN_SLACK_RAD = 0.1  # allowed between a wheel's angle by its spokes and by its mark, in addition to three sigmas
 OVERVIEW, CLOSER = "the overview", "a closer look"
 
 
@@ -42,11 +47,7 @@ def surfaces_in(image: Scan) -> RangeScene:
         Unsupported: the image is not a pinhole projection.
         InvalidRequest, NotFound: see `analyse`.
     """
-    c = image.capabilities
-    if c.projection != "pinhole":
-        raise Unsupported(f"{image.scanner} has {c.projection} projection", hint="use a pinhole range scanner")
-    sensor = PinholeSensor(width_px=c.width, height_px=c.height, fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy)
-    return analyse(image.depth_m, sensor)
+    return analyse(image.depth_m, image.pinhole())
 
 
 def find_by_surfaces(
@@ -66,22 +67,12 @@ def find_by_surfaces(
 
 def mark_of(sighting: Sighting, image: Scan, base_from_panel: UncertainPose) -> Mark:
     """Return the object's outline at its height, where it was found or else where it was looked for."""
-    panel_object = sighting.panel_object
-    found = sighting.base_from_object
-    base_from_object = (
-        found.parent_from_child
-        if found is not None
-        else base_from_panel.parent_from_child * RigidTransform.from_translation([*panel_object.position_m, 0.0])
-    )
-    turn = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS, endpoint=False)
-    radius, relief = max(panel_object.half_footprint_m), panel_object.relief
-    height_m = 0.0 if relief is None else relief.height_m
-    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(OUTLINE_POINTS, height_m)], axis=-1)
-    x, y, z = (image.base_from_scanner.parent_from_child.inv() * base_from_object).apply(ring).T
-    c, depth = image.capabilities, np.maximum(z, 1e-3)
+    name = sighting.panel_object.name
     return Mark(
-        outline_px=np.stack([c.fx * x / depth + c.cx, c.fy * y / depth + c.cy], axis=-1),
-        text=panel_object.name if sighting.match is not None else f"{panel_object.name}: {sighting.why}",
+        outline_px=outline_px(
+            sighting, image.pinhole(), image.base_from_scanner.parent_from_child, base_from_panel.parent_from_child
+        ),
+        text=name if sighting.match is not None else f"{name}: {sighting.why}",
         is_found=sighting.match is not None,
     )
 
@@ -137,33 +128,29 @@ def compared(
     Args:
         position_m: one sigma of the distance between an object of a built panel and its place in the file.
     """
-    panel_object, match = sighting.panel_object, sighting.match
-    if match is None or sighting.base_from_object is None:
+    panel_object, found = sighting.panel_object, sighting.base_from_object
+    vision_shows = _said(panel_object, reading)
+    place_check = check_place(sighting, base_from_panel, position_m)
+    if found is None or place_check is None:
         return SurfaceCheck(
             name=panel_object.name, kind=panel_object.kind, seen_from=place, found=False, agrees=None, centre_in_base_m=None,
-            off_m=None, sigma_m=None, chi_square=None, off_vision_m=None, shows=None, vision_shows=_said(panel_object, reading),
+            off_m=None, sigma_m=None, chi_square=None, off_vision_m=None, shows=None, vision_shows=vision_shows,
             stands_elsewhere=False,
             finding=f"not found by its surfaces: {sighting.why}",
         )  # fmt: skip
-    panel_from_object = compose(base_from_panel.inverse(), sighting.base_from_object)
-    x, y, z = sighting.base_from_object.parent_from_child.translation
-    at_m = panel_from_object.parent_from_child.translation[:2]
-    off = at_m - panel_object.position_m
-    C = panel_from_object.covariance[:2, :2] + position_m**2 * np.eye(2)
-    chi_square = float(off @ np.linalg.solve(C, off))
-    is_elsewhere = bool(chi_square > chdtri(2, ELSEWHERE_P))
-    shows_alike = _shows_alike(sighting, reading)
-    off_m, sigma_m = float(np.linalg.norm(off)), float(np.sqrt(0.5 * np.trace(C)))
+    x, y, z = found.parent_from_child.translation
+    is_alike = _shows_alike(sighting, reading)
+    off_m, sigma_m = place_check.off_m, place_check.sigma_m
     seen = None if reading is None or reading.centre_m is None else reading.centre_m[:2]
-    shows, vision_shows = _shown(sighting), _said(panel_object, reading)
     finding = f"stands {1e3 * off_m:.1f} mm from its place in the panel file (1 sigma {1e3 * sigma_m:.1f} mm)"
-    if not shows_alike:
-        finding += f"; shows {shows} by its surfaces and {vision_shows} by vision"
+    if not is_alike:
+        finding += f"; shows {_shown(sighting)} by its surfaces and {vision_shows} by vision"
     return SurfaceCheck(
-        name=panel_object.name, kind=panel_object.kind, seen_from=place, found=True, agrees=shows_alike and not is_elsewhere,
-        centre_in_base_m=(float(x), float(y), float(z)), off_m=off_m, sigma_m=sigma_m, chi_square=chi_square,
-        off_vision_m=None if seen is None else float(np.linalg.norm(at_m - seen)),
-        shows=shows, vision_shows=vision_shows, stands_elsewhere=is_elsewhere, finding=finding,
+        name=panel_object.name, kind=panel_object.kind, seen_from=place, found=True,
+        agrees=is_alike and not place_check.is_elsewhere,
+        centre_in_base_m=(float(x), float(y), float(z)), off_m=off_m, sigma_m=sigma_m, chi_square=place_check.chi_square,
+        off_vision_m=None if seen is None else float(np.linalg.norm(place_check.at_m - seen)),
+        shows=_shown(sighting), vision_shows=vision_shows, stands_elsewhere=place_check.is_elsewhere, finding=finding,
     )  # fmt: skip
 
 
@@ -208,17 +195,9 @@ def _said(panel_object: PanelObject, reading: ObjectReading | None) -> str | Non
 
 def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
     """Return whether surfaces and vision give the same state, or at least one of them gives none."""
-    relief, match, state = sighting.panel_object.relief, sighting.match, sighting.state
-    if relief is None or match is None or state is None or reading is None or not reading.answered:
+    if reading is None or not reading.answered:
         return True
-    if relief.motion == "slide":
-        return reading.state is None or _shown(sighting) == reading.state
-    if reading.value is None:
-        return True
-    spoke = 2.0 * np.pi / relief.turns
-    apart = abs((state - reading.value + 0.5 * spoke) % spoke - 0.5 * spoke)
-    sigma = np.hypot(match.state_sigma or 0.0, reading.uncertainty or 0.0)
-    return bool(apart <= TURN_SLACK_RAD + 3.0 * sigma)
+    return states_agree(sighting, state=reading.state, value=reading.value, sigma=reading.uncertainty)
 
 
 def _look_closer(session: Session, panel_object: PanelObject) -> SurfaceView | str:

@@ -21,7 +21,15 @@ from service.operations.stored import Pixels, blind_answer, blind_in_stored, pan
 from service.report.plots import png_of
 from service.report.surfaces import surfaces_picture
 from service.schema.requests import LearnRequest, RecogniseRequest
-from service.schema.results import LearnResult, RecogniseResult, SurfaceResult, SurfaceSighting, estimated, fields_of
+from service.schema.results import (
+    LearnResult,
+    RangeFindings,
+    RecogniseResult,
+    SurfaceResult,
+    SurfaceSighting,
+    estimated,
+    fields_of,
+)
 
 if TYPE_CHECKING:
     from hal.panel import Panel
@@ -41,7 +49,7 @@ def run_recognise(session: Session, request: RecogniseRequest) -> RecogniseResul
         answer = RecogniseResult(**fields_of(run_recognise_taught(session, request)))
     elif "vision" in request.use:
         answer = _blind(session, request)
-    return answer.model_copy(update=_by_range(session, request)) if "range" in request.use else answer
+    return answer.model_copy(update=fields_of(_by_range(session, request))) if "range" in request.use else answer
 
 
 def _blind(session: Session, request: RecogniseRequest) -> RecogniseResult:
@@ -57,8 +65,8 @@ def _blind(session: Session, request: RecogniseRequest) -> RecogniseResult:
     )
 
 
-def _by_range(session: Session, request: RecogniseRequest) -> dict[str, object]:
-    """Return the fields of the answer that come from one range image: its surfaces, and the objects found by them."""
+def _by_range(session: Session, request: RecogniseRequest) -> RangeFindings:
+    """Find the surfaces of one range image, and objects by them."""
     if request.move and "vision" not in request.use:
         ensure_located(session.part(0.0, 0.6))
         session.progress(0.6, "drive to the overview")
@@ -77,13 +85,13 @@ def _by_range(session: Session, request: RecogniseRequest) -> dict[str, object]:
     except NotFound as error:
         no_plate = error.what  # the other surfaces are still an answer
     drawn = surfaces_picture(scene, [mark_of(sighting, image, believed) for sighting in sightings])
-    return {
-        "surfaces": [_surface_result(surface) for surface in scene.surfaces],
-        "plate": plate,
-        "by_surfaces": [_sighting_result(sighting) for sighting in sightings],
-        "no_plate": no_plate,
-        "range_picture": session.context.task.artefact("surfaces.png", png_of(drawn), "image/png"),
-    }
+    return RangeFindings(
+        surfaces=[_surface_result(surface) for surface in scene.surfaces],
+        plate=plate,
+        by_surfaces=[_sighting_result(sighting) for sighting in sightings],
+        no_plate=no_plate,
+        range_picture=session.context.task.artefact("surfaces.png", png_of(drawn), "image/png"),
+    )
 
 
 def _surface_result(surface: Surface) -> SurfaceResult:

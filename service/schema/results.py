@@ -168,7 +168,17 @@ class InspectResult(Result):
     pictures: Pictures
 
 
-class RecogniseResult(Result):
+class RangeFindings(Result):
+    """The surfaces of a range image, and the objects that were found by their surfaces; null without `use` range."""
+
+    surfaces: list[SurfaceResult] | None = None
+    plate: Annotated[int | None, Field(description="label of the panel's plate among the surfaces")] = None
+    by_surfaces: list[SurfaceSighting] | None = None
+    no_plate: Annotated[str | None, Field(description="why the plate was not found")] = None
+    range_picture: str | None = None
+
+
+class RecogniseResult(RangeFindings):
     """Objects of the panel file or candidates of blind recognition, and surfaces of the range image."""
 
     panel: Annotated[str | None, Field(description="name of the panel in a stored image")] = None
@@ -176,11 +186,6 @@ class RecogniseResult(Result):
     missing: list[str] | None = None
     candidates: Annotated[list[CandidateResult] | None, Field(description="with mode `blind`")] = None
     pictures: Pictures | None = None
-    surfaces: Annotated[list[SurfaceResult] | None, Field(description="with `use` range")] = None
-    plate: Annotated[int | None, Field(description="label of the panel's plate among the surfaces")] = None
-    by_surfaces: list[SurfaceSighting] | None = None
-    no_plate: Annotated[str | None, Field(description="why the plate was not found")] = None
-    range_picture: str | None = None
 
 
 class LearnResult(Result):

@@ -56,7 +56,7 @@ async def take_over_lease(state: State, request: HolderBody) -> GrantView:
     return _grant(await state.act(functools.partial(state.service.lease.take_over, request.holder)))
 
 
-@router.get("/stop", summary="Is the software stop latched?", operation_id="show_stop", tags=["stop"])
+@router.get("/stop", summary="State of the software stop", operation_id="show_stop", tags=["stop"])
 async def show_stop(state: State) -> StopView:
     return _stop(state, state.service.supervisor.latch.state())
 

@@ -139,6 +139,8 @@ def _as_meant(table: Any, model: TypeAdapter[Any]) -> Any:
     except ValidationError as error:
         meant = json.loads(json.dumps(table, default=str))
         for item in error.errors():
+            if not item["loc"]:
+                continue  # a fault of the object as a whole
             *above, key = item["loc"]
             with suppress(KeyError, IndexError, TypeError):  # the fault is in something that is not in the table
                 inner = reduce(getitem, above, meant)

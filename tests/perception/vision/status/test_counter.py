@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
@@ -30,13 +32,25 @@ def counter(ink: str = "white", decimals: int = 0) -> Counter:
     )
 
 
-def drawn(spec: Counter, text: str, turned: float, rng: np.random.Generator) -> Patch:
+FOLDER = Path(matplotlib.get_data_path()) / "fonts/ttf"
+FONTS = ("DejaVuSans", "DejaVuSans-Bold", "DejaVuSansMono-Bold", "DejaVuSerif-Bold", "cmss10")
+
+
+def font_of(name: str | None, digit_px: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return a font of matplotlib's, or Pillow's own, whose digits are so tall."""
+    if name is None:
+        return ImageFont.load_default(size=digit_px / 0.72)
+    top, bottom = ImageFont.truetype(FOLDER / f"{name}.ttf", size=100).getbbox("0", anchor="ls")[1::2]
+    return ImageFont.truetype(FOLDER / f"{name}.ttf", size=100.0 * digit_px / (bottom - top))
+
+
+def drawn(spec: Counter, text: str, turned: float, rng: np.random.Generator, font_name: str | None = None) -> Patch:
     """The patch of a counter by Pillow's own font: uneven light, a tilt of up to 1.5 degrees, blur and noise."""
     scale = PX_PER_M * FINE
     w, h = round(MARGIN * spec.width_m * scale), round(MARGIN * spec.height_m * scale)
     ink, ground = (225, 35) if spec.ink == "white" else (40, 215)
     tall = rng.uniform(0.48, 0.58) * spec.height_m * scale
-    font = ImageFont.load_default(size=tall / 0.72)
+    font = font_of(font_name, tall)
     picture = Image.new("L", (w, h), 200)
     frame = Image.new("L", (round(spec.width_m * scale), round(spec.height_m * scale)), 60)
     cell_h, cell_w = round(WINDOW * frame.height), round(0.86 * frame.width / spec.digits)
@@ -65,13 +79,13 @@ def drawn(spec: Counter, text: str, turned: float, rng: np.random.Generator) -> 
     )  # fmt: skip
 
 
-def shown(seed: int) -> tuple[Counter, str, float, Patch]:
+def shown(seed: int, font_name: str | None = None) -> tuple[Counter, str, float, Patch]:
     """What the counter of a seed is, shows, and how that looks; every other one has its last drum between two digits."""
     rng = np.random.default_rng(seed)
     spec = counter("white" if seed % 3 else "black")
     text = f"{rng.integers(100_000):05d}"
     turned = float(rng.uniform(0.1, 0.8)) if seed % 2 else 0.0
-    return spec, text, turned, drawn(spec, text, turned, rng)
+    return spec, text, turned, drawn(spec, text, turned, rng, font_name)
 
 
 def test_of_twenty_counters_nineteen_are_read_and_none_is_wrong() -> None:
@@ -84,6 +98,19 @@ def test_of_twenty_counters_nineteen_are_read_and_none_is_wrong() -> None:
             assert reading.value == pytest.approx(int(text) + turned, abs=0.15), seed
             right += 1
     assert right >= 19
+
+
+@pytest.mark.parametrize("name", FONTS)
+def test_digits_of_other_typefaces_are_read_and_none_is_wrong(name: str) -> None:
+    right = 0
+    for seed in range(100, 108):
+        spec, text, turned, patch = shown(seed, name)
+        reading = read_counter(patch, spec)
+        if reading.answered:
+            assert reading.text == text, seed
+            assert reading.value == pytest.approx(int(text) + turned, abs=0.15), seed
+            right += 1
+    assert right >= 7
 
 
 @pytest.mark.parametrize(("text", "turned"), [("00999", 0.4), ("12399", 0.6), ("40009", 0.3)])

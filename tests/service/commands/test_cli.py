@@ -146,6 +146,22 @@ def test_init_copies_a_cell_that_doctor_accepts_and_never_overwrites(tmp_path: P
     assert "panels/bench.toml" in checked.stdout
 
 
+@pytest.mark.parametrize("command", [("doctor", "--no-connect"), ("demo",)], ids=["doctor", "reading"])
+def test_a_scale_in_degrees_under_a_key_for_radians_is_refused(command: tuple[str, ...], tmp_path: Path) -> None:
+    """Read as radians, such a gauge showed 7.88 bar instead of 1.08."""
+    assert _run("init", "mine", cwd=tmp_path).returncode == 0
+    panel = tmp_path / "mine/panels/bench.toml"
+    given = panel.read_text()
+    panel.write_text(given.replace("at_min = -2.3562, at_max = 2.3562", "at_min = -135.0, at_max = 135.0", 1))
+    assert panel.read_text() != given
+    done = _run(*command, "--cell", "cells/bench.toml", cwd=tmp_path / "mine")
+    said = " ".join((done.stdout + done.stderr).split())
+    assert done.returncode != 0 and "Traceback" not in said
+    assert "everything is in order" not in said
+    assert "-135 rad is beyond a full turn" in said and "at_min_deg = -135" in said and "at_max_deg = 135" in said
+    assert not list(tmp_path.rglob("report.json"))
+
+
 class Served:
     """`panelwright serve` in a separate process."""
 

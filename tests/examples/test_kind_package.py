@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -87,6 +88,17 @@ def test_the_mission_reads_the_counter_and_turns_the_knob_beside_it(mission: dic
 @pytest.mark.slow
 def test_the_package_brings_what_its_kind_looks_like(mission: dict[str, Any]) -> None:
     assert mission["kinds"].count("breaker") == 1
+
+
+def test_the_page_shows_what_the_package_does() -> None:
+    page = (ROOT / "docs/how-to/add-a-kind.md").read_text(encoding="utf-8")
+    package = ROOT / "examples/kind-package"
+    shown = {language: re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL) for language in ("python", "toml")}
+    files = [package / "acme_breaker/skill.py", package / "pyproject.toml", package / "panel.toml"]
+    blocks = [*shown["python"], *shown["toml"]]
+    assert len(blocks) == len(files)
+    for block, file in zip(blocks, files, strict=True):
+        assert block in file.read_text(encoding="utf-8")
 
 
 def test_without_its_package_the_kind_is_refused() -> None:

@@ -66,7 +66,7 @@ class Measurement:
             one. Zero when a point was sensed.
         label: how reports call it.
         sensor: which device or sense it came from.
-        part: which part of a shape with unknown measures it belongs to (`fusion.shapes`); empty for a fixed feature.
+        part: which part of a shape with unknown dimensions it belongs to (`fusion.shapes`); empty for a fixed feature.
     """
 
     cls: SensingClass

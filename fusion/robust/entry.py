@@ -50,10 +50,12 @@ def fuse(
         raise InvalidRequest("no measurement to fuse", hint="give at least one measurement or a prior pose")
     if shape is not None:
         if prior is None:
-            raise InvalidRequest("a shape needs a believed pose", hint="give `prior`, for example from the camera")
+            raise InvalidRequest(
+                "a measurement of a shape needs an initial pose", hint="give `prior`, for example from the camera"
+            )
         if certify or prove_set_within_s is not None:
             raise InvalidRequest(
-                "nothing can be proven of a shape with unknown measures",
+                "nothing can be proven of a shape whose dimensions are unknown",
                 hint="leave out `certify` and `prove_set_within_s`",
             )
         return fuse_shape(measurements, shape, prior)

@@ -39,7 +39,7 @@ class FollowingErrorMonitor:
             DeviceFailure: the drives are on, and the arm reports a position far from where they hold it.
         """
         if self._drives.are_on:
-            self._check_near(measured_rad, held.last_rad, "{} from where it was sent")
+            self._check_near(measured_rad, held.last_rad, "{} away from its last set-point")
 
     def resume(self, measured_rad: Array, filter_: SetPointLimiter) -> None:
         """Switch the drives on, with the set-point where the arm reports that it is.
@@ -52,7 +52,7 @@ class FollowingErrorMonitor:
         self._drives.switch_on()
         if self._is_doubted:
             taken_rad = self._drives.send(filter_.last_rad)
-            self._check_near(measured_rad, taken_rad, "it says that it stands {} from where its drives have it")
+            self._check_near(measured_rad, taken_rad, "it reports a position that is {} away from that of its drives")
             self._is_doubted = False
 
     def give_up(self, failed: str | None) -> None:

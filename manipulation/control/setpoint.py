@@ -116,7 +116,9 @@ def _check_trajectory(motion: JointTrajectory, kin: Kinematics, measured: Array)
 def _check_path(motion: CartesianPath, kin: Kinematics, measured: Array) -> None:
     _check_times(motion, motion.times_s)
     if len(motion.base_from_tool) != len(motion.times_s):
-        raise _refused(motion, f"{len(motion.base_from_tool)} poses for {len(motion.times_s)} times", "one pose a time")
+        raise _refused(
+            motion, f"{len(motion.base_from_tool)} poses for {len(motion.times_s)} times", "give one pose per time"
+        )
     places = np.array([pose.translation for pose in motion.base_from_tool])
     if not np.isfinite(places).all():
         raise _refused(motion, "a pose is not finite", "plan again")

@@ -94,7 +94,7 @@ class TerminationMonitor:
                 cause = f"contact force {np.linalg.norm(look.wrench[:3]):.0f} N; at most {guard.limit:.0f} N is allowed"
             case "tracking":
                 behind_m = np.linalg.norm(look.base_from_tool[:3, 3] - look.commanded_tip_m)
-                cause = f"{self._arm} does not follow: {1e3 * behind_m:.0f} mm from where it was sent"
+                cause = f"{self._arm} does not follow: {1e3 * behind_m:.0f} mm away from its last set-point"
                 device = self._arm
             case _:
                 side = "at most" if guard.below else "at least"

@@ -54,14 +54,16 @@ def perform(
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
         if outcome is Outcome.UNVERIFIED and seen is None:
-            cause += "; nobody looked" if verify is None else "; the look afterwards could not tell"
+            cause += (
+                "; no reading was asked for afterwards" if verify is None else "; the reading afterwards was refused"
+            )
             break
         if outcome is Outcome.UNVERIFIED:
             outcome, cause = Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"
             if not repeats:
                 break
         if outcome is Outcome.STALLED and seen is None and not repeats:
-            cause += "; whether it counted nobody can tell, and another try might undo it"
+            cause += "; it is unknown whether it had an effect, and another try might undo it"
             break
         if outcome is Outcome.STIFF:
             break

@@ -47,7 +47,7 @@ def test_a_box_is_measured_with_its_pose() -> None:
 
 
 def test_a_shape_needs_a_believed_pose() -> None:
-    with pytest.raises(InvalidRequest, match="believed pose"):
+    with pytest.raises(InvalidRequest, match="initial pose"):
         fuse(mixture(4, 15).measurements, shape=Box(size_m=(0.1, 0.1, 0.1)))
 
 

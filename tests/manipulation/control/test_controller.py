@@ -246,7 +246,7 @@ def test_an_arm_that_says_it_is_not_where_it_was_held_is_not_sent_there(rig: Rig
     if act == "motion":
         report = rig.controller.execute(Hold(name="settle", duration_s=0.1))
         assert (report.outcome, report.device) == (MotionOutcome.FAULT, "arm")
-        assert "from where it was sent; nothing moved" in report.cause
+        assert "away from its last set-point; nothing moved" in report.cause
     else:
         with pytest.raises(DeviceFault, match="does not follow"):
             rig.controller.tare()

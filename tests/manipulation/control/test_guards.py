@@ -173,7 +173,7 @@ def test_what_always_holds_says_how_much_it_was_and_names_an_arm_that_does_not_f
     behind = watch()
     end = [behind.ending(0.002 * tick, SAMPLE, look(behind_m=0.0312)) for tick in range(5)][-1]
     assert end is not None and end.device == "left_arm"
-    assert end.cause == "left_arm does not follow: 31 mm from where it was sent"
+    assert end.cause == "left_arm does not follow: 31 mm away from its last set-point"
 
 
 def test_an_arm_20_mm_behind_for_five_ticks_is_a_fault() -> None:

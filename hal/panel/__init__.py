@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from hal.panel.rotary import Rotary
     from hal.panel.slider import Slider
     from hal.panel.toggle import Toggle
+    from hal.panel.turn import Tilt
 
 __all__ = [
     "GAUGE_SHARE",
@@ -79,6 +80,7 @@ __all__ = [
     "StateGoal",
     "States",
     "Taught",
+    "Tilt",
     "Toggle",
     "Tolerances",
     "Vector2",

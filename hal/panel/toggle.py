@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
-
-from pydantic import AfterValidator
+from typing import Any, Literal
 
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face
 from hal.panel.goals import StateGoal
 from hal.panel.parts import Positive, Vector2
 from hal.panel.questions import Taught
-from hal.panel.turn import below_a_quarter
+from hal.panel.turn import Tilt
 
 
 class Toggle(PanelObject):
@@ -21,7 +19,7 @@ class Toggle(PanelObject):
     kind: Literal["toggle"] = "toggle"
     bat_length_m: Positive = 0.020
     bat_radius_m: Positive = 0.004
-    tilt_rad: Annotated[Positive, AfterValidator(below_a_quarter)] = 0.40
+    tilt_rad: Tilt = 0.40
     force_n: Positive = 6.0
 
     @property

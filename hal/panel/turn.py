@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from pydantic import AfterValidator, ValidationInfo
+from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic_core import PydanticCustomError
 
 TURN_RAD = 2.0 * math.pi + 0.01
@@ -47,3 +47,5 @@ Angle = Annotated[float, AfterValidator(_within_a_turn)]
 """An angle in radians of at most a full turn to either side."""
 Turns = Annotated[float, AfterValidator(_within_turns)]
 """An angle in radians of a part that may turn several times."""
+Tilt = Annotated[float, Field(gt=0), AfterValidator(below_a_quarter)]
+"""An angle in radians by which a part leans, more than 0 and less than a quarter of a turn."""

@@ -14,10 +14,13 @@ from manipulation.skills.repeat import perform
 from manipulation.skills.rotary import turn_bar
 
 TOLERANCE_RATIO = 0.02
-GIVE_RAD = np.radians(6.5)
-"""How far the pads twist on the bar under the knob's friction: measured 4 degrees in a turn of 9, 8 in 25 and more.
+GIVE_RAD = np.radians(8.3)
+"""How far the pads lag behind on the bar, under the knob's friction, at the end of a long turn.
 
-A firmer grip twists less, but at 25 N a side force of up to 50 N ends the turn."""
+Measured: 4 degrees in a turn of 9, 8 in turns of 28 to 103. A firmer grip lags less, but at 25 N a side force of up to 50 N
+ends the turn."""
+GIVE_WITHIN_RAD = np.radians(7.0)
+"""The turn in which 63 % of that lag has come about."""
 
 
 def knob(
@@ -49,7 +52,8 @@ def knob(
 
     def stroke(attempt: Attempt) -> float:
         start, goal = scale.place_of(where.known), scale.place_of(target)
-        return where.moved_to(scale.value_at(turn_bar(attempt, panel_object, start, goal, over_rad=GIVE_RAD)))
+        lag = GIVE_RAD * (1.0 - float(np.exp(-abs(goal - start) / GIVE_WITHIN_RAD)))
+        return where.moved_to(scale.value_at(turn_bar(attempt, panel_object, start, goal, over_rad=lag)))
 
     return perform(
         context,

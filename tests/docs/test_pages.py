@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 import subprocess
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from hal.config import load_cell
-from hal.panel import load_panel
+from hal.panel import PanelObject, load_panel
+from hal.panel.kinds import KINDS
 from service.cli import _app
 from tests.docs import commands_page
 from tests.docs.blocks import PAGES, ROOT, page_name
@@ -35,6 +37,17 @@ def test_every_shipped_cell_loads(path: Path) -> None:
 @pytest.mark.parametrize("path", sorted((ROOT / "panels").glob("*.toml")), ids=lambda path: path.name)
 def test_every_shipped_panel_loads(path: Path) -> None:
     assert len(load_panel(path).lights) == 4
+
+
+@pytest.mark.parametrize("point", entry_points(group=KINDS), ids=lambda point: point.name)
+def test_the_page_of_the_panel_file_has_every_key_of_the_products_kinds(point: EntryPoint) -> None:
+    if not point.module.startswith("hal."):
+        pytest.skip("a kind of another package")
+    page = (ROOT / "docs/reference/panel-file.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| `{point.name}` \| (.*?) \|", page, re.MULTILINE)
+    named = re.findall(r"`(\w+)`", re.sub(r"\([^)]*\)", "", row))
+    own = set(point.load().model_fields) - set(PanelObject.model_fields)
+    assert sorted(named) == sorted(own)
 
 
 def test_every_command_that_the_pages_name_exists() -> None:

@@ -42,7 +42,7 @@ Connect = Callable[[str, str, dict[str, Any]], Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class WireFinding:
     """One line of the doctor's report; `hint` states the remedy if the finding is not good."""
 
     subject: str
@@ -51,7 +51,7 @@ class Finding:
     hint: str = ""
 
 
-def examine(cell: Cell) -> Iterator[Finding]:
+def examine(cell: Cell) -> Iterator[WireFinding]:
     """Examine every serial port of this machine, then every device of the cell that has its own link."""
     for path in serial_ports():
         yield examine_port(path)
@@ -67,23 +67,23 @@ def serial_path(options: Mapping[str, Any]) -> str | None:
     return found if isinstance(found, str) and "/" in found else None
 
 
-def examine_port(path: str, *, sysfs: Path = SYSFS) -> Finding:
+def examine_port(path: str, *, sysfs: Path = SYSFS) -> WireFinding:
     """Check whether the port exists, may be opened, is held by a process, and how long its adapter buffers bytes.
 
     Args:
         sysfs: directory where the kernel describes serial ports.
     """
     if not Path(path).exists():
-        return Finding(path, False, "does not exist", "plug the device in, or correct the path in the cell file")
+        return WireFinding(path, False, "does not exist", "plug the device in, or correct the path in the cell file")
     if not os.access(path, os.R_OK | os.W_OK):
         hint = "add your user to the group that owns the port, usually `dialout`, and log in again"
-        return Finding(path, False, "you may not open it", hint)
+        return WireFinding(path, False, "you may not open it", hint)
     if (owner := port_owner(path)) is not None:
-        return Finding(path, False, f"taken by {owner}", "close that program or choose another port")
+        return WireFinding(path, False, f"taken by {owner}", "close that program or choose another port")
     timer_ms = latency_timer_ms(path, sysfs=sysfs)
     if timer_ms is None:
-        return Finding(path, True, "free; its driver has no latency timer")
-    return Finding(path, True, f"free; latency timer {timer_ms} ms", TIMER_HINT if timer_ms > SLOW_TIMER_MS else "")
+        return WireFinding(path, True, "free; its driver has no latency timer")
+    return WireFinding(path, True, f"free; latency timer {timer_ms} ms", TIMER_HINT if timer_ms > SLOW_TIMER_MS else "")
 
 
 def examine_device(
@@ -93,8 +93,8 @@ def examine_device(
     path: str,
     *,
     open_device: Connect | None = None,
-    look_at: Callable[[str], Finding] = examine_port,
-) -> Iterator[Finding]:
+    look_at: Callable[[str], WireFinding] = examine_port,
+) -> Iterator[WireFinding]:
     """Examine the device's port, then the device as configured; if it gives no data, try other baud rates.
 
     Args:
@@ -103,12 +103,12 @@ def examine_device(
     """
     port = look_at(path)
     if not port.is_good:
-        yield Finding(name, False, f"{path} {port.what}", port.hint)
+        yield WireFinding(name, False, f"{path} {port.what}", port.hint)
         return
     opened = open_device or _connect
     try:
         with closing(opened(name, driver, options)) as device:
-            yield Finding(name, True, measured(device))
+            yield WireFinding(name, True, measured(device))
         return
     except ConfigError:
         raise
@@ -116,9 +116,9 @@ def examine_device(
         told = error
     baud = _answering_baud(name, driver, options, opened) if isinstance(told, DeviceUnavailable) else None
     if baud is None:
-        yield Finding(name, False, told.what, told.hint)
+        yield WireFinding(name, False, told.what, told.hint)
     else:
-        yield Finding(name, False, f"wrong baud rate: it answers at {baud}", f"set `baud = {baud}` in its options")
+        yield WireFinding(name, False, f"wrong baud rate: it answers at {baud}", f"set `baud = {baud}` in its options")
 
 
 def _connect(name: str, driver: str, options: dict[str, Any]) -> Any:

@@ -19,7 +19,7 @@ IN_DOCS = "the reference is in docs/"
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class FieldFault:
     """Fault in a file: the key path, what is wrong with its value, and the remedy."""
 
     key: str
@@ -32,7 +32,7 @@ class Fault:
         said = _said(self.key, self.text)
         return said if self.hint.startswith("see ") or self.hint.endswith(IN_DOCS) else f"{said}; {self.hint}"
 
-    def below(self, key: str) -> Fault:
+    def below(self, key: str) -> FieldFault:
         """Return the same fault for a table that is under `key` of the file."""
         return replace(self, key=f"{key}.{self.key}".rstrip("."))
 
@@ -94,7 +94,7 @@ def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:
         raise refusal(_faults(error, data, model), source=source) from error
 
 
-def faults_in(data: dict[str, Any], model: type[Strict]) -> list[Fault]:
+def faults_in(data: dict[str, Any], model: type[Strict]) -> list[FieldFault]:
     """Return all faults of plain data for `model`; empty when the data are valid."""
     try:
         _parsed(data, model)
@@ -103,7 +103,7 @@ def faults_in(data: dict[str, Any], model: type[Strict]) -> list[Fault]:
     return []
 
 
-def refusal(faults: list[Fault], *, source: str) -> ConfigError:
+def refusal(faults: list[FieldFault], *, source: str) -> ConfigError:
     """Return one error that names all faults of a file; its remedy is that of the first fault."""
     more = f" (and {len(faults) - 1} more {'fault' if len(faults) == 2 else 'faults'})" if len(faults) > 1 else ""
     first = faults[0]
@@ -121,7 +121,7 @@ def _parsed(data: dict[str, Any], model: type[M]) -> M:
     return model.model_validate_json(json.dumps(data, default=str), strict=True)
 
 
-def _faults(error: ValidationError, data: dict[str, Any], model: type[Strict]) -> list[Fault]:
+def _faults(error: ValidationError, data: dict[str, Any], model: type[Strict]) -> list[FieldFault]:
     found = error.errors()
     known = {(item["loc"], item["msg"]) for item in found}
     found += [item for item in model.further_faults(data) if (item["loc"], item["msg"]) not in known]
@@ -129,21 +129,21 @@ def _faults(error: ValidationError, data: dict[str, Any], model: type[Strict]) -
     return [_fault(item, model) for item in sorted(found, key=lambda item: item["type"] != "extra_forbidden")]
 
 
-def _fault(item: Any, model: type[BaseModel]) -> Fault:
+def _fault(item: Any, model: type[BaseModel]) -> FieldFault:
     path = _path_in_file(item["loc"], model)
     key = ".".join(str(part) for part in path)
     if item["type"] == "extra_forbidden":
         hint = item.get("ctx", {}).get("hint") or unknown_key_hint(model, item["loc"])
-        return Fault(key, f"unknown key {path[-1]!r}", hint, is_unknown_key=True)
+        return FieldFault(key, f"unknown key {path[-1]!r}", hint, is_unknown_key=True)
     if item["type"] == "missing":
-        return Fault(key, "is missing", f"add {key}; {IN_DOCS}")
+        return FieldFault(key, "is missing", f"add {key}; {IN_DOCS}")
     given, hint = repr(item.get("input")), item.get("ctx", {}).get("hint")
     if hint is not None:  # the model supplies the remedy
-        return Fault(key, item["msg"], hint)
+        return FieldFault(key, item["msg"], hint)
     if item["type"] == "value_error":
-        return Fault(key, item["msg"].removeprefix("Value error, "), REFERENCE)
+        return FieldFault(key, item["msg"].removeprefix("Value error, "), REFERENCE)
     said = f"{item['msg']} (given: {given[:60]})"
-    return Fault(key, said, f"{REFERENCE} for type, unit and range")
+    return FieldFault(key, said, f"{REFERENCE} for type, unit and range")
 
 
 def _said(*parts: str) -> str:

@@ -33,7 +33,7 @@ READS: dict[DeviceKind, str] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Snapshot:
+class ReceivedReading:
     """A reading and the monotonic time in seconds at which this process got it."""
 
     stamped: Stamped[Any]
@@ -52,10 +52,10 @@ class ReadingDesk:
         self._connection = connection
         self._lock = threading.Lock()
         self._device_locks: dict[str, threading.Lock] = {}
-        self._snapshots: dict[str, Snapshot] = {}
-        self._pictures: dict[str, tuple[Snapshot, bytes]] = {}
+        self._snapshots: dict[str, ReceivedReading] = {}
+        self._pictures: dict[str, tuple[ReceivedReading, bytes]] = {}
 
-    def read(self, name: str, *, max_age_s: float) -> Snapshot:
+    def read(self, name: str, *, max_age_s: float) -> ReceivedReading:
         """Return a reading of the device that is at most `max_age_s` old.
 
         Raises:
@@ -73,7 +73,7 @@ class ReadingDesk:
             kind = connection.cell.file.devices[name].kind
             stamped = getattr(device, READS[kind])(deadline=Deadline.after(connection.clock, READ_TIMEOUT_S))
             age_s = stamped.age_s(connection.clock.now_s())
-            snapshot = Snapshot(stamped=stamped, age_s=age_s, got_s=time.monotonic())
+            snapshot = ReceivedReading(stamped=stamped, age_s=age_s, got_s=time.monotonic())
             self._snapshots[name] = snapshot
             return snapshot
 
@@ -106,7 +106,7 @@ class ReadingDesk:
         return stream.getvalue()
 
 
-def as_json(name: str, kind: DeviceKind, snapshot: Snapshot) -> dict[str, Any]:
+def as_json(name: str, kind: DeviceKind, snapshot: ReceivedReading) -> dict[str, Any]:
     """Return a reading with its stamps as plain values; pictures are described, not listed."""
     stamped = snapshot.stamped
     return {

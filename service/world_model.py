@@ -19,7 +19,7 @@ from hal.geometry import UncertainPose, transform_rpy
 
 if TYPE_CHECKING:
     from manipulation import Kinematics
-    from manipulation.plausibility import Frame
+    from manipulation.plausibility import FrameDigest
     from perception.vision import ObjectReading
 
 
@@ -36,7 +36,7 @@ class Facts:
 
     base_from_panel: UncertainPose | None = None
     readings: Mapping[str, ObjectReading] = field(default_factory=lambda: MappingProxyType({}))
-    frames: Mapping[str, Frame] = field(default_factory=lambda: MappingProxyType({}))
+    frames: Mapping[str, FrameDigest] = field(default_factory=lambda: MappingProxyType({}))
     kinematics: Kinematics | None = None
 
 
@@ -78,7 +78,7 @@ class WorldModel:
             )
         )
 
-    def note_frame(self, device: str, frame: Frame) -> Frame | None:
+    def note_frame(self, device: str, frame: FrameDigest) -> FrameDigest | None:
         """Store the newest frame of a sensor; returns the previous one."""
         before = self._change(lambda facts: replace(facts, frames=MappingProxyType({**facts.frames, device: frame})))
         return before.frames.get(device)

@@ -28,10 +28,10 @@ from simbackend.wire import (
     LIGHTS_AT,
     MAX_PROXIMITY,
     REQUEST,
-    Drive,
+    DriveCommand,
     Op,
-    Picture,
     PictureInfo,
+    PictureType,
     Snapshot,
     WorldConfig,
 )
@@ -183,26 +183,26 @@ class WorldClient:
     def is_enabled(self) -> bool:
         """Return whether the drives would follow a set-point given now."""
         for orders in (int(self._request[2]), self._under_way):
-            if orders & Drive.ENABLE:
+            if orders & DriveCommand.ENABLE:
                 return True
-            if orders & Drive.STOP:
+            if orders & DriveCommand.STOP:
                 return False
         return self.frame.snapshot.is_enabled
 
     def enable(self) -> None:
         """Enable the drives from the next tick on."""
         with self._orders:
-            self._request[2] = (int(self._request[2]) & Drive.STOP) | Drive.ENABLE
+            self._request[2] = (int(self._request[2]) & DriveCommand.STOP) | DriveCommand.ENABLE
 
     def stop(self) -> None:
         """Brake from the next tick on, whatever else was pending."""
         with self._orders:
-            self._request[2] = Drive.STOP
+            self._request[2] = DriveCommand.STOP
 
     def aim_arm(self, position_rad: Array) -> None:
         """Set the set-point of the next tick."""
         with self._orders:
-            self._request[2] = int(self._request[2]) | Drive.SETPOINT
+            self._request[2] = int(self._request[2]) | DriveCommand.SETPOINT
             self._request[JOINTS_AT : JOINTS_AT + len(position_rad)] = position_rad
 
     def aim_gripper(self, width_m: float, force_n: float, speed_m_per_s: float) -> None:
@@ -223,14 +223,14 @@ class WorldClient:
         The white plate is about 0.8.
         """
         channels = 3 if is_colour else 1
-        return self._picture(view, Picture(channels), (view.height, view.width, channels))
+        return self._picture(view, PictureType(channels), (view.height, view.width, channels))
 
     def depth_m(self, view: CameraView) -> tuple[PictureInfo, NDArray[np.float32]]:
         """Return the depth along the view at the present tick, (H, W), NaN where there is no surface."""
-        return self._picture(view, Picture.DEPTH, (view.height, view.width))
+        return self._picture(view, PictureType.DEPTH, (view.height, view.width))
 
     def _picture(
-        self, view: CameraView, kind: Picture, shape: tuple[int, ...]
+        self, view: CameraView, kind: PictureType, shape: tuple[int, ...]
     ) -> tuple[PictureInfo, NDArray[np.float32]]:
         matrix = np.asarray(view.flange_from_camera.as_matrix())[:3]
         lens = [view.width, view.height, view.near_m, *view.focal, *view.centre]

@@ -28,7 +28,7 @@ class Op(IntEnum):
     TRUTH = 3
 
 
-class Drive(IntEnum):
+class DriveCommand(IntEnum):
     """Commands to the arm's drives in a step, one bit each, obeyed in this order.
 
     (An `IntFlag` costs 3 us per access.)
@@ -47,7 +47,7 @@ JOINTS_AT, GRIPPER_AT, LIGHTS_AT = 3, 9, 13
 CAMERA_AT = 9
 
 
-class Picture(IntEnum):
+class PictureType(IntEnum):
     """Type of data that an image request returns in shared memory."""
 
     DEPTH = 0  # float32 metres along the view, NaN where there is no surface

@@ -28,7 +28,7 @@ from simbackend.wire import (
     LIGHTS_AT,
     MAX_PROXIMITY,
     PROXIMITY_TICKS,
-    Drive,
+    DriveCommand,
     WorldConfig,
 )
 
@@ -162,11 +162,11 @@ class World:
 
     def _obey(self, request: Array) -> None:
         orders = int(request[2])
-        if orders & Drive.STOP:
+        if orders & DriveCommand.STOP:
             self.drive.stop()
-        if orders & Drive.ENABLE:
+        if orders & DriveCommand.ENABLE:
             self.drive.enable(self.q[:DOF])
-        if orders & Drive.SETPOINT:
+        if orders & DriveCommand.SETPOINT:
             self.drive.aim(request[JOINTS_AT : JOINTS_AT + DOF])
         if request[GRIPPER_AT]:
             self.gripper.aim(*(float(x) for x in request[GRIPPER_AT + 1 : GRIPPER_AT + 4]))

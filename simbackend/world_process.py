@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.cpu_affinity import share_core
-from simbackend.wire import CAMERA_AT, DOUBLE, IMAGE_BYTES, REQUEST, Op, Picture, PictureInfo, read_exactly
+from simbackend.wire import CAMERA_AT, DOUBLE, IMAGE_BYTES, REQUEST, Op, PictureInfo, PictureType, read_exactly
 from simbackend.world import World
 
 
@@ -65,7 +65,7 @@ def picture(world: World, request: Array, images: mmap.mmap) -> PictureInfo:
         near_m=near_m,
         channels=int(kind),
     )
-    if Picture(int(kind)) is Picture.DEPTH:
+    if PictureType(int(kind)) is PictureType.DEPTH:
         with np.errstate(divide="ignore"):
             _put(images, np.where(inverse_depth > 0.0, 1.0 / inverse_depth, np.nan).astype(np.float32))
     else:

@@ -113,7 +113,7 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class PortRecording:
     """Recording from one opening of the port to its loss."""
 
     name: str
@@ -121,7 +121,7 @@ class Session:
     events: tuple[Event, ...]
 
 
-def read_capture(path: Path) -> list[Session]:
+def read_capture(path: Path) -> list[PortRecording]:
     """Return the sessions of a capture file.
 
     Raises:
@@ -150,7 +150,7 @@ def read_capture(path: Path) -> list[Session]:
                 break  # the writer was killed in the middle of a line
             what = f"{path}, line {number} is no line of a capture: {error!r}"
             raise ConfigError(what, hint="give a file that `capture` has written") from error
-    return [Session(name, byte_s, tuple(events)) for name, byte_s, events in sessions]
+    return [PortRecording(name, byte_s, tuple(events)) for name, byte_s, events in sessions]
 
 
 class ReplayLink:
@@ -160,7 +160,7 @@ class ReplayLink:
     time base, so on a busy machine a replay runs later but stays the same. The end of the recording is a lost link.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: PortRecording) -> None:
         self._events = list(session.events[::-1])  # reversed: the next event is the last element
         self._name = f"replay of {session.name}"
         self._byte_s = session.byte_s

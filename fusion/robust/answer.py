@@ -17,7 +17,7 @@ from fusion.errors import Contradiction
 from fusion.measurement import Measurement
 from fusion.robust.evidence import log_evidence
 from fusion.robust.inliers import ProvenSet, best_set
-from fusion.robust.minima import Minimum
+from fusion.robust.minima import PoseMinimum
 from fusion.solve.local import LocalSolution
 from fusion.solve.observability import FreeDirection
 from hal.arrays import Array
@@ -155,8 +155,8 @@ class FusedPose:
 
 def judged(
     b: Batch,
-    best: Minimum,
-    others: Sequence[Minimum],
+    best: PoseMinimum,
+    others: Sequence[PoseMinimum],
     index: NDArray[np.int64],
     given: Sequence[Measurement],
     repeats: dict[int, int],
@@ -239,7 +239,9 @@ def weighed(
     return values, tuple(sorted([*mismatched, *repeated], key=lambda r: r.index)), evidence
 
 
-def _alternatives(best: Minimum, others: Sequence[Minimum], index: NDArray[np.int64]) -> tuple[Alternative, ...]:
+def _alternatives(
+    best: PoseMinimum, others: Sequence[PoseMinimum], index: NDArray[np.int64]
+) -> tuple[Alternative, ...]:
     made = [
         Alternative(
             pose=m.local.base_from_object,
@@ -254,7 +256,7 @@ def _alternatives(best: Minimum, others: Sequence[Minimum], index: NDArray[np.in
     return tuple(sorted(made, key=lambda a: -a.odds))
 
 
-def _odds(m: Minimum, best: Minimum) -> float:
+def _odds(m: PoseMinimum, best: PoseMinimum) -> float:
     """Return exp(-delta/2) sqrt(det cov / det cov_best), the ratio of the posterior masses around both (Laplace)."""
     size = np.linalg.slogdet(m.local.covariance)[1] - np.linalg.slogdet(best.local.covariance)[1]
     return float(np.exp(min(0.5 * (best.cost - m.cost) + 0.5 * size, 0.0)))

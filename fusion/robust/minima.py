@@ -40,14 +40,14 @@ FREE_COSINE = math.cos(0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Minimum:
+class PoseMinimum:
     """A minimum of the truncated error; `used` (N,) marks the measurements inside their gates."""
 
     cost: float
     used: Flags
     local: LocalSolution
 
-    def near(self, other: Minimum) -> bool:
+    def near(self, other: PoseMinimum) -> bool:
         """Return whether `other` is another pose and good enough to be reported."""
         apart = not _same(other.local.rotation, other.local.translation_m, self.local)
         return apart and other.cost < self.cost + ALTERNATIVE_COST
@@ -62,11 +62,11 @@ class Candidates:
     cost: Array
 
 
-def minima(b: Batch, rng: np.random.Generator) -> tuple[Minimum, list[Minimum]]:
+def minima(b: Batch, rng: np.random.Generator) -> tuple[PoseMinimum, list[PoseMinimum]]:
     """Return the best minimum and the other distinct ones within ALTERNATIVE_COST, best first."""
     n = len(b.cls)
     small = b if n <= MOST_SEARCHED else b.part(np.sort(rng.choice(n, MOST_SEARCHED, replace=False)))
-    found: list[Minimum] = []
+    found: list[PoseMinimum] = []
     poses = _search(small, rng)
     for k in range(min(READMITTED, len(poses.cost))):
         search.readmit(small, poses.R[k], poses.t[k], poses.cost[k])
@@ -187,7 +187,7 @@ def _mirrored(b: Batch, R: Array, t: Array) -> Candidates:
     return Candidates(R=Rs, t=ts, cost=costs)
 
 
-def finished(b: Batch, R: Array, t: Array) -> Minimum:
+def finished(b: Batch, R: Array, t: Array) -> PoseMinimum:
     """Return the exact minimum near R, t, with the set of used measurements made consistent with the exact gate."""
     f = np.empty(len(b.cls))
     values(b, R, t, False, f)
@@ -198,7 +198,7 @@ def finished(b: Batch, R: Array, t: Array) -> Minimum:
         if np.array_equal(inside, used) or not inside.any():
             break
         used, R, t = inside, local.rotation, local.translation_m
-    return Minimum(cost=float(np.minimum(local.values, b.gate).sum()), used=used, local=local)
+    return PoseMinimum(cost=float(np.minimum(local.values, b.gate).sum()), used=used, local=local)
 
 
 def _same(R: Array, t: Array, local: LocalSolution, *, share: float = 1.0) -> bool:

@@ -12,8 +12,8 @@ from hal.face import load_on_first_use
 if TYPE_CHECKING:
     from manipulation.plausibility.finding import Finding, Symptom
     from manipulation.plausibility.proximity import ProximityMonitor
-    from manipulation.plausibility.repetition import Frame, repeated_frame
+    from manipulation.plausibility.repetition import FrameDigest, repeated_frame
 
-__all__ = ["Finding", "Frame", "ProximityMonitor", "Symptom", "repeated_frame"]
+__all__ = ["Finding", "FrameDigest", "ProximityMonitor", "Symptom", "repeated_frame"]
 if not TYPE_CHECKING:
     __getattr__ = load_on_first_use(__name__, __file__)

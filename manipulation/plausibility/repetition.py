@@ -17,20 +17,20 @@ FROZEN_S, FROZEN_TICKS, FROZEN_PERIODS = 0.1, 10, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Frame:
+class FrameDigest:
     """A frame of a camera or range scanner: when it was taken (cell clock, s) and a digest of its array."""
 
     stamp_s: float
     digest: bytes
 
     @classmethod
-    def of(cls, array: NDArray[np.generic], *, stamp_s: float) -> Frame:
+    def of(cls, array: NDArray[np.generic], *, stamp_s: float) -> FrameDigest:
         """Return the frame of an array."""
         digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest()
         return cls(stamp_s=stamp_s, digest=digest)
 
 
-def repeated_frame(device: str, before: Frame | None, newest: Frame) -> Finding | None:
+def repeated_frame(device: str, before: FrameDigest | None, newest: FrameDigest) -> Finding | None:
     """Find a device that sent the same frame again under another time stamp."""
     if before is None or before.digest != newest.digest or before.stamp_s == newest.stamp_s:
         return None

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from perception.range.matching.cross_check import PlaceCheck, check_place, outline_px, states_agree
     from perception.range.matching.match import Match, match_models
     from perception.range.matching.models import load_models, shipped_models
-    from perception.range.matching.panel_objects import PanelView, Sighting, find_objects
+    from perception.range.matching.panel_objects import PanelScan, Sighting, find_objects
     from perception.range.plane import PlaneFit, fit_plane_near
     from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface, SurfaceType
     from perception.range.recordings import Reading, assumptions, load_recording
@@ -31,7 +31,7 @@ __all__ = [
     "KeptResults",
     "Match",
     "OrthographicSensor",
-    "PanelView",
+    "PanelScan",
     "PinholeSensor",
     "PlaceCheck",
     "Plane",

@@ -13,7 +13,7 @@ from hal.devices import ArmCapabilities, DeviceKind
 from hal.errors import ConfigError
 from hal.geometry import transform_rpy
 from hal.registry import KnowsItsArm, device_factory, kinds_of, options_model
-from hal.strict import Fault, faults_in, refusal, validate
+from hal.strict import FieldFault, faults_in, refusal, validate
 from manipulation import Kinematics, is_in_reach
 
 FULL_TURN_RAD = math.tau + 1e-3
@@ -35,7 +35,7 @@ def check_cell(cell: Cell) -> None:
         raise refusal(faults, source=str(cell.path))
 
 
-def unit_faults(data: Any, key: str = "") -> list[Fault]:
+def unit_faults(data: Any, key: str = "") -> list[FieldFault]:
     """Return faults for angles beyond a full turn and for lengths beyond any cell, in nested tables."""
     if isinstance(data, dict):
         below = [unit_faults(value, f"{key}.{name}".lstrip(".")) for name, value in data.items()]
@@ -46,25 +46,27 @@ def unit_faults(data: Any, key: str = "") -> list[Fault]:
     name = key.rpartition(".")[2]
     if name.endswith("_rad") and name not in JOINT_LIMITS and any(abs(n) > FULL_TURN_RAD for n in numbers):
         as_rad = ", ".join(f"{math.radians(n):.4g}" for n in numbers)
-        return [Fault(key, f"{_short(data)} is more than a full turn", f"if these are degrees, write {as_rad} rad")]
+        return [
+            FieldFault(key, f"{_short(data)} is more than a full turn", f"if these are degrees, write {as_rad} rad")
+        ]
     if name.endswith("_m") and any(abs(n) > LARGEST_M for n in numbers):
         as_m = ", ".join(f"{n / 1e3:.4g}" for n in numbers)
-        return [Fault(key, f"{_short(data)} is larger than a cell", f"if these are millimetres, write {as_m} m")]
+        return [FieldFault(key, f"{_short(data)} is larger than a cell", f"if these are millimetres, write {as_m} m")]
     return []
 
 
-def device_faults(cell: Cell) -> list[Fault]:
+def device_faults(cell: Cell) -> list[FieldFault]:
     """Return faults for a missing arm, unknown or wrong drivers, options that a driver refuses, and missing mounts."""
     faults = []
     if not cell.names_of(DeviceKind.ARM):
         hint = 'add [devices.arm] with kind = "arm" and its driver; `panelwright doctor` lists them'
-        faults.append(Fault("devices", "the cell has no arm", hint))
+        faults.append(FieldFault("devices", "the cell has no arm", hint))
     for name, section in cell.file.devices.items():
         faults += [fault.below(f"devices.{name}") for fault in _faults_of(cell, name, section)]
     return faults
 
 
-def reach_faults(cell: Cell) -> list[Fault]:
+def reach_faults(cell: Cell) -> list[FieldFault]:
     """Return a fault if the panel is out of the arm's reach; needs a driver that knows its kinematics unconnected."""
     reached = objects_in_reach(cell)
     if reached is None or any(reached.values()) or not reached:
@@ -72,7 +74,7 @@ def reach_faults(cell: Cell) -> list[Fault]:
     position_m = list(cell.file.workspace.panel_position_m)
     distance_m = float(np.linalg.norm(position_m))
     return [
-        Fault(
+        FieldFault(
             "workspace.panel_position_m",
             f"{position_m} is {distance_m:.2f} m from the arm's foot, and the arm reaches none of the panel's objects there",
             "give the place of the panel's middle in the base frame, and panel_rpy_rad so that its z axis points to the arm",
@@ -99,17 +101,17 @@ def objects_in_reach(cell: Cell) -> dict[str, bool] | None:
     }
 
 
-def _faults_of(cell: Cell, name: str, section: DeviceSection) -> Iterator[Fault]:
+def _faults_of(cell: Cell, name: str, section: DeviceSection) -> Iterator[FieldFault]:
     """Yield the faults of one device, with keys relative to its table."""
     try:
         factory = device_factory(section.driver)
     except ConfigError as error:
-        yield Fault("driver", error.what, error.hint)
+        yield FieldFault("driver", error.what, error.hint)
         return
     kinds = kinds_of(factory)
     if kinds is not None and section.kind not in kinds:
         are = " and ".join(f"a {kind}" for kind in kinds)
-        yield Fault(
+        yield FieldFault(
             "driver", f"{section.driver!r} is {are}, and kind is {section.kind}", _other_driver(section, kinds[0])
         )
     model = options_model(factory)
@@ -120,7 +122,7 @@ def _faults_of(cell: Cell, name: str, section: DeviceSection) -> Iterator[Fault]
         yield from (fault.below("options") for fault in of_options)
     if section.kind in LOOKING and section.mount is None:
         hint = f'add mount = {{ parent = "flange", calibration = "{name}" }} and that calibration record'
-        yield Fault("mount", f"is missing, so the pose of the {section.kind} is not known", hint)
+        yield FieldFault("mount", f"is missing, so the pose of the {section.kind} is not known", hint)
 
 
 def _other_driver(section: DeviceSection, is_kind: DeviceKind) -> str:

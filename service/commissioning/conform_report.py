@@ -20,7 +20,7 @@ WORST_FIRST = ("failed", "skipped", "not tried", "passed")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class PromiseResult:
     """The result of one promise of one device.
 
     Attributes:
@@ -43,7 +43,7 @@ class Notebook:
 
     def __init__(self, level: str) -> None:
         self.level = level
-        self.findings: list[Finding] = []
+        self.findings: list[PromiseResult] = []
         self.is_stopped = False
         self._levels: dict[str, str] = {}
         self._open: list[str] = []
@@ -86,7 +86,7 @@ class Notebook:
         self._open = [other for other in self._open if other != node]
         _, class_name, test = node.split("::")
         self.findings.append(
-            Finding(
+            PromiseResult(
                 device=class_name.removeprefix("Test_"),
                 promise=test.removeprefix("test_").replace("_", " "),
                 level=self._levels[node],
@@ -145,7 +145,7 @@ def as_data(cell: Cell, devices: Sequence[str], notebook: Notebook) -> dict[str,
     }
 
 
-def _device(cell: Cell, name: str, findings: list[Finding]) -> dict[str, Any]:
+def _device(cell: Cell, name: str, findings: list[PromiseResult]) -> dict[str, Any]:
     section = cell.file.devices[name]
     emulator = cell.file.emulators.get(name)
     return {

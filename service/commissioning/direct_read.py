@@ -30,7 +30,7 @@ ERROR_REST_S = 0.02  # limits the rate of errors from an absent device
 
 
 @contextmanager
-def only_device(
+def device_alone(
     cell: Cell, name: str, more_options: Mapping[str, Any] = MappingProxyType({})
 ) -> Iterator[tuple[Callable[[], Any], Clock, dict[str, Any]]]:
     """Yield a function that connects the device `name`, its clock and its options; its emulator runs meanwhile, if any.
@@ -73,7 +73,7 @@ def read_lines(cell: Cell, name: str, *, samples: int, timeout_s: float) -> Iter
         timeout_s: deadline of each call.
     """
     kind = cell.file.devices[name].kind if name in cell.file.devices else DeviceKind.ARM
-    with only_device(cell, name) as (connect, clock, _):
+    with device_alone(cell, name) as (connect, clock, _):
         left = samples
         for _ in range(CONNECT_ATTEMPTS):
             started_s = time.monotonic()

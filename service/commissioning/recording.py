@@ -13,7 +13,7 @@ from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError
 from hal.registry import Context, connect
-from service.commissioning.direct_read import only_device, samples_of
+from service.commissioning.direct_read import device_alone, samples_of
 from service.jsonable import jsonable
 
 ABOUT = "about"  # kind of the line that describes the device; the drivers ignore it
@@ -43,7 +43,7 @@ def record(
     """
     if path.exists():
         raise ConfigError(f"{path} exists already", hint="choose another name, or remove it; nothing was written")
-    with only_device(cell, name, {"capture": str(path)}) as (connect_it, clock, options):
+    with device_alone(cell, name, {"capture": str(path)}) as (connect_it, clock, options):
         section = cell.file.devices[name]
         line = {"dir": ABOUT, "device": name, "kind": section.kind, "driver": section.driver, "options": options}
         header = json.dumps(jsonable(line)) + "\n"

@@ -29,7 +29,7 @@ from service.http import (
     tasks,
     verbs,
 )
-from service.http.guard import Allowed, Guard
+from service.http.guard import Allowed, RequestGuard
 from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
 from service.http.metrics import Metrics
@@ -98,12 +98,12 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
     app.mount("/", Page(WEB, app.routes), name="page")
     bodies = [operation.request_model for operation in service.operations.values()]
     app.openapi = lambda: _document(app, bodies)  # type: ignore[method-assign]  # the documented way to extend it
-    return Guard(app, allowed=allowed, count=state.metrics.count_answer)
+    return RequestGuard(app, allowed=allowed, count=state.metrics.count_answer)
 
 
 def state_of_app(guarded: ASGIApp) -> AppState:
     """Return the state of an application that `create_app` made."""
-    assert isinstance(guarded, Guard)  # noqa: S101 - narrowing: `create_app` returns a Guard
+    assert isinstance(guarded, RequestGuard)  # noqa: S101 - narrowing: `create_app` returns a RequestGuard
     state: AppState = guarded.inner.state.panelwright
     return state
 

@@ -40,7 +40,7 @@ class Allowed:
     origins: frozenset[str]
 
 
-class Guard:
+class RequestGuard:
     """ASGI middleware that refuses requests before the application sees them."""
 
     def __init__(self, app: FastAPI, *, allowed: Allowed, count: Callable[[int], None]) -> None:

@@ -92,7 +92,7 @@ class SweptImage:
     newest: Stamped[RangeImage]
 
 
-def only_device(session: Session, kind: DeviceKind, name: str | None = None) -> tuple[str, Any]:
+def device_of_kind(session: Session, kind: DeviceKind, name: str | None = None) -> tuple[str, Any]:
     """Return name and device of a kind: the named device, or the first one in the cell file.
 
     Raises:
@@ -122,7 +122,7 @@ def look(session: Session, camera: str | None = None) -> Look:
         StaleReading: the camera repeats an old frame.
         DeviceError: the camera does not deliver.
     """
-    name, device = only_device(session, DeviceKind.CAMERA, camera)
+    name, device = device_of_kind(session, DeviceKind.CAMERA, camera)
     asked_s = session.connection.clock.now_s()
     sample = device.read_image(deadline=deadline())
     pixels = sample.usable(now_s=asked_s, max_age_s=OLDEST_S, device=name).pixels
@@ -140,7 +140,7 @@ def look(session: Session, camera: str | None = None) -> Look:
 
 def look_with_lights(session: Session) -> LightPair:
     """Return an image with the border lights off and one with them on; they are switched off again afterwards."""
-    name, lights = only_device(session, DeviceKind.LIGHTS)
+    name, lights = device_of_kind(session, DeviceKind.LIGHTS)
     channels = len(lights.capabilities().channels)
     wait_s = max(SETTLE_S, lights.capabilities().settle_s)
     _switch(session, name, lights, (False,) * channels, wait_s)
@@ -155,7 +155,7 @@ def look_with_lights(session: Session) -> LightPair:
 
 def scan(session: Session) -> Scan:
     """Return one range image from the present pose of the arm, which must be at rest; a line scanner is swept."""
-    name, device = only_device(session, DeviceKind.RANGE_SCANNER)
+    name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
     capabilities = device.capabilities()
     if capabilities.needs_sweep:
         swept = sweep_scanner(session, name, device)
@@ -200,7 +200,7 @@ def _switch(session: Session, name: str, lights: Any, on: tuple[bool, ...], wait
 
 def _refuse_frozen(session: Session, name: str, sample: Stamped[Any], array: NDArray[Any]) -> None:
     """Raise `StaleReading` if a camera or scanner repeats a frame under a new time stamp."""
-    newest = plausibility.Frame.of(array, stamp_s=sample.host_time_s)
+    newest = plausibility.FrameDigest.of(array, stamp_s=sample.host_time_s)
     finding = plausibility.repeated_frame(name, session.world.note_frame(name, newest), newest)
     if finding is not None:
         raise finding.error()

@@ -42,7 +42,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     target = target_of(panel_object, body)
     eye = _Eye(session, panel_object, verify)
     before = eye.before()
-    current = None if before is None else state_of(before, eye.witness)
+    current = None if before is None else object_state(before, eye.witness)
     report = operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
     reached = report.is_done
     return Deed(
@@ -139,7 +139,7 @@ class _Eye:
         self._session.world.forget_reading(self.witness.name)
         self._session.world.forget_reading(self._panel_object.name)
         self.last = self._look()
-        return None if self.last is None else state_of(self.last, self.witness)
+        return None if self.last is None else object_state(self.last, self.witness)
 
     def _look(self) -> ObjectReading | None:
         try:
@@ -156,7 +156,7 @@ class _Eye:
         return reading if reading.present and reading.answered else None
 
 
-def state_of(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
+def object_state(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
     """Convert a reading to the object state that skills use."""
     angle_rad = reading.value if panel_object.value_is_angle else None
     if angle_rad is None and reading.state is not None:

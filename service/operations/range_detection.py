@@ -17,7 +17,7 @@ from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose
 from hal.panel import Panel, PanelObject
 from perception.range import (
-    PanelView,
+    PanelScan,
     RangeScene,
     Sighting,
     Surface,
@@ -55,7 +55,7 @@ def find_by_surfaces(
 ) -> list[Sighting]:
     """Find the panel's objects with a relief in a scan; see `find_objects`."""
     depth_m = np.asarray(image.depth_m, float)
-    view = PanelView(
+    view = PanelScan(
         scene=scene,
         depth_m=depth_m,
         base_from_sensor=image.base_from_scanner,

@@ -120,10 +120,10 @@ def feel(session: Session, touches: int, known: Sequence[Observation], tolerance
         NotFound: fewer than three places could be touched, and the pose is not accurate enough; gives the reasons.
         Stopped: somebody stopped the cell.
     """
-    return follow(session, touch_plan(session, touches, known, tolerance), touches)
+    return touch_by_plan(session, touch_plan(session, touches, known, tolerance), touches)
 
 
-def follow(session: Session, plan: TouchPlan, touches: int) -> Felt:
+def touch_by_plan(session: Session, plan: TouchPlan, touches: int) -> Felt:
     """Touch the places of the plan in order of their gain; see `feel`."""
     observations: list[Observation] = []
     accounts: list[TouchResult] = []

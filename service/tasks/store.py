@@ -19,14 +19,14 @@ from service.jsonable import jsonable
 from service.problem import problem_of
 from service.tasks.model import Artefact, Task, TaskEvent, TaskState
 
-__all__ = ["Artefact", "Recorder", "Task", "TaskContext", "TaskEvent", "TaskState", "TaskStore"]
+__all__ = ["Artefact", "Task", "TaskContext", "TaskEvent", "TaskRecorder", "TaskState", "TaskStore"]
 
 CANCEL_REPEAT_S = 0.05  # repeated, because a cancel between two motions must also end the second one
 MAX_ARTEFACT_BYTES = 64_000_000
 log = logging.getLogger(__name__)
 
 
-class Recorder(Protocol):
+class TaskRecorder(Protocol):
     """The interface through which tasks are recorded (the journal)."""
 
     def append(self, kind: str, data: dict[str, Any]) -> None:
@@ -104,7 +104,7 @@ class TaskStore:
         self,
         folder: Path,
         *,
-        recorder: Recorder,
+        recorder: TaskRecorder,
         stop_motion: Callable[[], None],
         max_queued: int = 16,
         keep: int = 200,

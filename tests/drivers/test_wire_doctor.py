@@ -12,7 +12,7 @@ from drivers.emulators import lms200, tfmini
 from drivers.emulators.ports import PtyPort
 from drivers.emulators.scripted import ScriptedProximity, ScriptedScanner
 from drivers.transport.serial_link import latency_timer_ms, port_owner, shorten_latency_timer
-from drivers.wire_doctor import Finding, examine_device, examine_port, measured, serial_path
+from drivers.wire_doctor import WireFinding, examine_device, examine_port, measured, serial_path
 from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.registry import Context, connect
 
@@ -99,7 +99,7 @@ def test_a_driver_at_the_wrong_baud_rate_is_told_the_one_that_answers() -> None:
         patch.setattr(tfmini, "PtyPort", NoisyAtOtherBauds)
         far_side = tfmini.start(ScriptedProximity(), {})
     path = str(far_side.port.path)
-    options, free = {"port": path, "baud": 9600}, Finding(path, True, "free")
+    options, free = {"port": path, "baud": 9600}, WireFinding(path, True, "free")
     with closing(far_side):
         found = list(examine_device("finger", "serial:tfmini", options, path, look_at=lambda _: free))
     assert [(f.is_good, f.what) for f in found] == [(False, "wrong baud rate: it answers at 115200")]

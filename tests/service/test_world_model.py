@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.config import load_cell
 from hal.geometry import UncertainPose
-from manipulation.plausibility import Frame
+from manipulation.plausibility import FrameDigest
 from perception.vision import ObjectReading
 from service.world_model import Facts, WorldModel, expected_panel
 
@@ -60,7 +60,7 @@ def test_readings_that_come_from_many_threads_at_once_are_all_kept() -> None:
 
 def test_a_frame_is_kept_for_each_sensor_and_the_one_before_is_returned() -> None:
     world = WorldModel()
-    first, second = Frame(stamp_s=1.0, digest=b"1"), Frame(stamp_s=2.0, digest=b"2")
+    first, second = FrameDigest(stamp_s=1.0, digest=b"1"), FrameDigest(stamp_s=2.0, digest=b"2")
     assert world.note_frame("camera", first) is None
     assert world.note_frame("scanner", first) is None
     assert world.note_frame("camera", second) is first

@@ -45,7 +45,7 @@ def models_of(panel: Panel) -> dict[str, ComponentModel]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PanelView:
+class PanelScan:
     """An analysed range image of a panel.
 
     Attributes:
@@ -61,7 +61,7 @@ class PanelView:
     base_from_panel: UncertainPose
 
 
-def find_objects(panel: Panel, view: PanelView) -> list[Sighting]:
+def find_objects(panel: Panel, view: PanelScan) -> list[Sighting]:
     """Search a range image for each object of a panel file that has a relief, near its expected position."""
     reliefs = {one.name: one.relief for one in panel.objects if one.relief is not None}
     if not reliefs:
@@ -74,7 +74,7 @@ def find_objects(panel: Panel, view: PanelView) -> list[Sighting]:
 
 
 def _sighting(
-    panel_object: PanelObject, relief: Relief, model: ComponentModel, view: PanelView, points: Array
+    panel_object: PanelObject, relief: Relief, model: ComponentModel, view: PanelScan, points: Array
 ) -> Sighting:
     """Search for one object. For speed, only those of `points` (H, W, 3; panel frame) that lie near it are matched."""
     away = np.abs(points[..., :2] - panel_object.position_m).max(axis=-1)

@@ -38,7 +38,7 @@ NOT_DISTINCT = "nothing there stands out as a whole: come closer, or change the 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Shown:
+class ShownObject:
     """An object of the panel in the overview.
 
     Attributes:
@@ -69,7 +69,7 @@ class PanelLooks:
 
     knowledge: Knowledge
     added: dict[str, int]
-    shown: tuple[Shown, ...]
+    shown: tuple[ShownObject, ...]
     left_out: dict[str, str]
     known_before: tuple[str, ...]
     known_now: tuple[str, ...]
@@ -129,9 +129,9 @@ def _check_most_are_there(readings: Sequence[ObjectReading], panel: Panel) -> No
 
 def _objects(
     overview: Overview, view: PanelProjection, panel: Panel, readings: Sequence[ObjectReading], places: Array
-) -> tuple[tuple[Shown, ...], dict[str, str]]:
+) -> tuple[tuple[ShownObject, ...], dict[str, str]]:
     """Return the objects that can teach, and the reason why each of the others cannot."""
-    shown: list[Shown] = []
+    shown: list[ShownObject] = []
     left_out: dict[str, str] = {}
     for panel_object, reading in zip(panel.objects, readings, strict=True):
         if not reading.present:
@@ -146,7 +146,7 @@ def _objects(
         (left, top), (right, bottom) = _box(overview, view, panel_object, shift_px)
         corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
         shown.append(
-            Shown(
+            ShownObject(
                 panel_object=panel_object,
                 place_px=place,
                 middle_m=middle_m,
@@ -197,7 +197,7 @@ def _on_ground(overview: Overview, pixels: Array) -> Array:
 
 
 def _of_nothing(
-    overview: Overview, view: PanelProjection, panel: Panel, shown: Sequence[Shown], places: Array
+    overview: Overview, view: PanelProjection, panel: Panel, shown: Sequence[ShownObject], places: Array
 ) -> Array:
     """Return the looks (N, LENGTH) of the sub-objects that belong to no object, shown or not."""
     middles = np.array([each.place_px for each in shown])
@@ -212,7 +212,7 @@ def _of_nothing(
 
 
 def _grown(
-    overview: Overview, shown: Sequence[Shown], nothing: Array, knowledge: Knowledge, source: str
+    overview: Overview, shown: Sequence[ShownObject], nothing: Array, knowledge: Knowledge, source: str
 ) -> tuple[Knowledge, dict[str, int]]:
     """Return the knowledge with the looks that it does not imply yet, and the number of new looks per kind."""
     own = look_at(overview.ground, np.array([each.place_px for each in shown]))
@@ -236,14 +236,16 @@ def _grown(
     return grown, added
 
 
-def _recognised(overview: Overview, places: Array, shown: Sequence[Shown], knowledge: Knowledge) -> tuple[str, ...]:
+def _recognised(
+    overview: Overview, places: Array, shown: Sequence[ShownObject], knowledge: Knowledge
+) -> tuple[str, ...]:
     """Return the names of the objects that blind recognition finds in this overview."""
     looks = look_at(overview.ground, places)
     found = chosen(overview.ground, places, looks, knowledge, overview.view, overview.plate_m)
     return tuple(each.panel_object.name for each in shown if any(_is(each, candidate) for candidate in found))
 
 
-def _is(shown: Shown, candidate: Detection) -> bool:
+def _is(shown: ShownObject, candidate: Detection) -> bool:
     """Return whether a detection is the given object."""
     if candidate.reason is not None or candidate.kind != shown.panel_object.kind:
         return False

@@ -9,7 +9,7 @@ import pytest
 
 from hal.devices import ForceTorqueCapabilities
 from hal.errors import StaleReading
-from manipulation.plausibility import Frame, Symptom, repeated_frame
+from manipulation.plausibility import FrameDigest, Symptom, repeated_frame
 from manipulation.plausibility.repetition import RepeatedWrench
 from tests.manipulation.rig import FakeForceTorque, World
 
@@ -65,7 +65,7 @@ PICTURE = np.arange(12.0).reshape(3, 4)
 
 
 def test_a_frame_that_comes_again_under_a_new_stamp_names_its_camera() -> None:
-    finding = repeated_frame("eye", Frame.of(PICTURE, stamp_s=1.0), Frame.of(PICTURE.copy(), stamp_s=1.1))
+    finding = repeated_frame("eye", FrameDigest.of(PICTURE, stamp_s=1.0), FrameDigest.of(PICTURE.copy(), stamp_s=1.1))
     assert finding is not None and finding.device == "eye"
     error = finding.error()
     assert isinstance(error, StaleReading) and error.details["cause"] == "frozen" and "power-cycle" in error.hint
@@ -77,5 +77,5 @@ def test_a_frame_that_comes_again_under_a_new_stamp_names_its_camera() -> None:
     ids=["first", "asked for twice", "noise", "mirrored"],
 )
 def test_a_first_frame_the_same_one_and_another_are_no_repetition(before: np.ndarray | None, stamp_s: float) -> None:
-    earlier = None if before is None else Frame.of(before, stamp_s=1.0)
-    assert repeated_frame("eye", earlier, Frame.of(PICTURE, stamp_s=stamp_s)) is None
+    earlier = None if before is None else FrameDigest.of(before, stamp_s=1.0)
+    assert repeated_frame("eye", earlier, FrameDigest.of(PICTURE, stamp_s=stamp_s)) is None

@@ -62,7 +62,7 @@ def follow(monkeypatch: pytest.MonkeyPatch, toucher: Toucher, made: TouchPlan, m
     monkeypatch.setattr(sense, "mounts_of", lambda *_: {})
     monkeypatch.setattr(sense, "error_budget", lambda spots, *_: touch_at(spots[0]))
     session: Any = SimpleNamespace(panel=PANEL, progress=lambda *_: None)
-    return sense.follow(session, made, most)
+    return sense.touch_by_plan(session, made, most)
 
 
 def test_each_touch_brings_what_it_was_expected_to(monkeypatch: pytest.MonkeyPatch) -> None:

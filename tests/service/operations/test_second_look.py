@@ -8,7 +8,7 @@ import numpy as np
 
 from hal.panel import Slider, load_panel
 from perception.vision.reading import ObjectReading
-from service.operations.manipulate import state_of
+from service.operations.manipulate import object_state
 
 PANEL = Path(__file__).parents[3] / "panels" / "bench.toml"
 
@@ -23,6 +23,6 @@ def reading(uncertainty: float | None) -> ObjectReading:
 def test_the_skill_learns_how_sure_the_look_is() -> None:
     panel_object = load_panel(PANEL).object("setpoint")
     assert isinstance(panel_object, Slider)
-    assert state_of(reading(0.3), panel_object).sigma == 0.3
-    assert state_of(reading(None), panel_object).sigma == 0.0
-    assert state_of(reading(0.3), panel_object).value == 71.1
+    assert object_state(reading(0.3), panel_object).sigma == 0.3
+    assert object_state(reading(None), panel_object).sigma == 0.0
+    assert object_state(reading(0.3), panel_object).value == 71.1

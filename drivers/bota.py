@@ -117,7 +117,7 @@ class Bota(StreamDevice[Wrench]):
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each complete frame; the power-up text means that the sensor has lost its settings."""
         if POWER_UP_TEXT in self._tail + chunk:
-            raise NoAnswer("the sensor has started anew")
+            raise NoAnswer("the sensor has restarted, so it has lost its settings")
         self._tail = (self._tail + chunk)[1 - len(POWER_UP_TEXT) :]
         for frame in self._framer.feed(chunk):
             self._take(frame, arrived_s - FRAME_BYTES * self.byte_s)

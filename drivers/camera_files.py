@@ -85,27 +85,30 @@ class CameraFiles(FilePlayer[Image]):
         finally:
             video.release()
         if not frames:
-            raise self._missing(f"{path} is no video that can be read", "give a folder of pictures or a video")
+            raise self._missing(f"{path} cannot be read as a video", "give a folder of pictures or a video")
         return frames
 
     def _load(self, index: int) -> Pixels:
         if index >= len(self._frames) and not self._options.repeat:
             raise self._missing(
-                f"all {len(self._frames)} pictures have been shown", "set repeat = true, or connect again"
+                f"all {len(self._frames)} pictures have been shown",
+                "set repeat = true, or connect the camera again to begin with the first",
             )
         frame = self._frames[index % len(self._frames)]
         if isinstance(frame, Path):
             raw = cv2.imread(str(frame), cv2.IMREAD_COLOR)
             if raw is None:
                 self.errors += 1
-                raise DeviceFault(f"{self.name}: {frame} is no picture", hint="remove or replace it", device=self.name)
+                raise DeviceFault(
+                    f"{self.name}: {frame} cannot be read as a picture", hint="remove or replace it", device=self.name
+                )
             frame = to_pixels(raw, is_colour=self._options.is_colour)
         if index > 0 and frame.shape != self._shape:
             self.errors += 1
             height_px, width_px = frame.shape[:2]
             raise DeviceFault(
                 f"{self.name}: picture {index} is {width_px}x{height_px}, the first {self._size[0]}x{self._size[1]}",
-                hint="pictures of one camera have one size",
+                hint="all pictures of one camera must have the same size",
                 device=self.name,
             )
         return frame

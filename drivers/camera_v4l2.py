@@ -131,12 +131,14 @@ class CameraV4l2(PortDevice[Image]):
             self._failures += 1
             self.errors += 1
             if self._failures >= GRAB_FAILURES:
-                raise LinkLost(f"{self.link_name()} gives no more frames")
+                raise LinkLost(f"{self.link_name()} delivers no more frames")
             return
         self._failures = 0
         o = self._options
         if frame.shape[:2] != (o.height_px, o.width_px):
-            raise NoAnswer(f"the camera gives {frame.shape[1]}x{frame.shape[0]} instead of {o.width_px}x{o.height_px}")
+            raise NoAnswer(
+                f"the camera delivers {frame.shape[1]}x{frame.shape[0]} instead of {o.width_px}x{o.height_px}"
+            )
         image = Image(pixels=to_pixels(frame, is_colour=o.is_colour), exposure_s=o.exposure_s or 1.0 / o.rate_hz)
         self.publish(image, valid_s=arrived_s - 1.0 / o.rate_hz)
 

@@ -99,9 +99,9 @@ class DepthCamera(FilePlayer[RangeImage]):
         try:
             depth_m = _read(path, o.unit_m)
         except (OSError, ValueError, IndexError, EOFError, BadZipFile) as error:
-            raise self._fault(f"{path} is no depth picture: {error}") from error
+            raise self._fault(f"{path} is not a depth picture: {error}") from error
         if depth_m.ndim != 2 or (index > 0 and depth_m.shape != self._shape):
-            raise self._fault(f"{path} has shape {depth_m.shape}")
+            raise self._fault(f"{path} has shape {depth_m.shape}, not (rows, columns) as the first picture")
         is_seen = (depth_m >= o.min_range_m) & (depth_m <= o.max_range_m)
         return np.where(is_seen, depth_m, np.nan).astype(np.float32)
 

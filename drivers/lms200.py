@@ -118,7 +118,7 @@ class Lms200(LineScanner):
         variant = struct.pack("<BHH", VARIANT, o.field_deg, o.step_hundredths_deg)
         answer = self._ask(link, variant, VARIANT | 0x80, SLOW_S)
         if answer[1:2] != b"\x01":
-            what = f"{o.field_deg} deg in steps of {o.step_hundredths_deg / 100} deg are refused"
+            what = f"the scanner refuses a field of {o.field_deg} deg in steps of {o.step_hundredths_deg / 100} deg"
             raise Refused(what, code=int.from_bytes(answer[1:2]))
         self._set_mode(link, bytes([SET_UP]) + PASSWORD, SET_UP_S)
         config = bytearray(self._ask(link, bytes([READ_CONFIG]), READ_CONFIG | 0x80, SLOW_S)[1:-1])
@@ -133,7 +133,7 @@ class Lms200(LineScanner):
     def _set_mode(self, link: Link, mode: bytes, wait_s: float = SLOW_S) -> None:
         answer = self._ask(link, bytes([MODE]) + mode, MODE | 0x80, wait_s)
         if len(answer) > 1 and answer[1] != 0:
-            raise Refused(f"operating mode {mode[0]:02X}h is refused", code=answer[1])
+            raise Refused(f"the scanner refuses operating mode {mode[0]:02X}h", code=answer[1])
 
     def _find(self, link: Link) -> int:
         """Return the baud rate at which the scanner agrees to stop streaming; the configured rate is tried first."""
@@ -177,7 +177,7 @@ class Lms200(LineScanner):
                     over_s = now_s() + 0.05 + 1.2 * attempt * (now_s() - asked_s)
                     drain_until_quiet(link, quiet_s=over_s, until_s=over_s)
                 if answer[0] == NOT_ACCEPTED:
-                    raise Refused(f"command {payload[0]:02X}h is not accepted", code=NOT_ACCEPTED)
+                    raise Refused(f"the scanner does not accept command {payload[0]:02X}h", code=NOT_ACCEPTED)
                 return answer
         raise NoAnswer(f"no answer to command {payload[0]:02X}h")
 

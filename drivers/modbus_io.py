@@ -40,7 +40,8 @@ class IoOptions(ModbusOptions):
     def _points_exist(self) -> Self:
         wired = self.wired()
         if wired and max(wired) >= self.inputs:
-            raise ValueError(f"input {max(wired)} is wired, but only {self.inputs} inputs are read (key `inputs`)")
+            most = f"the driver reads only inputs 0 to {self.inputs - 1} (key `inputs`)"
+            raise ValueError(f"input {max(wired)} is used, but {most}: increase `inputs` or correct the number")
         return self
 
     def wired(self) -> tuple[int, ...]:

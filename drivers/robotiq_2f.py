@@ -31,8 +31,8 @@ ACTIVATION_PENDING = 5
 FAULTS = {
     7: "not activated",
     8: "too hot",
-    9: "no host for 1 s",
-    10: "supply too low",
+    9: "no request from the host for 1 s",
+    10: "supply voltage too low",
     11: "automatic release under way",
     12: "internal fault",
     13: "activation failed",
@@ -217,7 +217,9 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
 
     def _inactive(self) -> DeviceFault:
         return DeviceFault(
-            f"{self.name} is not activated", hint="connect it again: activation moves the jaws", device=self.name
+            f"{self.name} is not activated",
+            hint="connect it again, which activates it and moves its jaws",
+            device=self.name,
         )
 
     def _count(self, width_m: float) -> int:

@@ -162,7 +162,8 @@ class Scip(LineScanner):
         except (KeyError, ValueError) as error:
             raise NoAnswer(f"the scanner's parameters lack {error}; is it a SCIP 2.0 scanner?") from None
         if number["ARES"] < 1 or number["SCAN"] < 1:
-            raise NoAnswer(f"the scanner says ARES {number['ARES']}, SCAN {number['SCAN']}: no scanner turns like that")
+            said = f"ARES {number['ARES']} steps per turn, SCAN {number['SCAN']} turns per minute"
+            raise NoAnswer(f"the scanner reports {said}, but both must be at least 1; is it a SCIP 2.0 scanner?")
         step_rad = math.tau / number["ARES"] * self._options.cluster
         return Beams(
             count=(number["AMAX"] - number["AMIN"]) // self._options.cluster + 1,

@@ -35,7 +35,7 @@ BAUDS = (
 SAMPLES = 30
 SLOW_TIMER_MS = 2
 TIMER_HINT = (
-    "the drivers shorten it when they open the port, if they may; for good by a udev rule: "
+    "the drivers shorten it when they open the port, if they have permission; a udev rule makes this permanent: "
     'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{latency_timer}="1"'
 )
 Connect = Callable[[str, str, dict[str, Any]], Any]

@@ -63,10 +63,12 @@ class MountRecord(Strict):
     def _is_a_covariance(self) -> MountRecord:
         if len(self.correlations) not in (0, CORRELATIONS):
             raise ValueError(
-                f"correlations are {CORRELATIONS} numbers, a lower triangle; here are {len(self.correlations)}"
+                f"correlations must be {CORRELATIONS} numbers, a lower triangle, not {len(self.correlations)}"
             )
         if np.linalg.eigvalsh(self._correlation_matrix())[0] < -ROUNDING:
-            raise ValueError("no six axes can be correlated like this: the matrix has a negative eigenvalue")
+            raise ValueError(
+                "correlations contradict each other: their matrix has a negative eigenvalue; check the numbers and their order"
+            )
         return self
 
     def pose(self) -> UncertainPose:

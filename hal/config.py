@@ -112,7 +112,8 @@ class CellFile(Strict):
     def _stand_ins_have_their_place(self) -> CellFile:
         for name in self.emulators:
             if name not in self.devices:
-                raise ValueError(f"emulators.{name} stands for no device; devices: {', '.join(self.devices)}")
+                known = f"devices: {', '.join(self.devices)}"
+                raise ValueError(f"emulators.{name} must have the name of the device that it emulates; {known}")
         if self.emulators and self.cell.mode == "real":
             raise ValueError("emulators need cell.mode = 'mixed' or 'sim'")
         if self.simulation.cables and self.cell.mode == "real":

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Any, ClassVar
 
-REINSTALL = "install panelwright anew: `make setup` in a checkout, else `pip install --force-reinstall panelwright`"
+REINSTALL = "reinstall panelwright: `make setup` in a checkout, else `pip install --force-reinstall panelwright`"
 """The remedy when a package that the product needs is missing or is of the wrong version."""
 
 

@@ -63,7 +63,10 @@ class FrameTree:
         ancestor: str | None = parent
         while ancestor is not None:
             if ancestor == name:
-                raise InvalidRequest(f"frame {name!r} cannot hang on itself", hint="choose another parent")
+                raise InvalidRequest(
+                    f"frame {name!r} cannot be its own ancestor",
+                    hint="choose a parent that is not attached to this frame",
+                )
             ancestor = self.parent_of(ancestor)
         return FrameTree(links={**self.links, name: (parent, parent_from_child)})
 

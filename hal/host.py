@@ -119,7 +119,7 @@ def _send(channel: Channel, answer: tuple[str, Any]) -> None:
     except (EOFError, OSError):
         raise
     except Exception as error:  # it cannot be pickled, so nothing was sent yet
-        channel.send(("defect", f"its answer cannot leave the process: {type(error).__name__}: {error}"))
+        channel.send(("defect", f"its return value cannot be sent to another process: {type(error).__name__}: {error}"))
 
 
 class Proxy:
@@ -174,7 +174,7 @@ class Proxy:
         given = kwargs.get("deadline")
         deadline = given if isinstance(given, Deadline) else None
         if not self._lock.acquire(timeout=-1.0 if deadline is None else deadline.remaining_s() + ANSWER_MARGIN_S):
-            raise self._late(method, "an earlier call holds it up")
+            raise self._late(method, "it waited for an earlier call to the same device")
         try:
             outcome, value = self._exchange(method, args, kwargs, deadline)
         finally:
@@ -219,7 +219,7 @@ class Proxy:
 
     def _lost(self, error: BaseException) -> DeviceUnavailable:
         return DeviceUnavailable(
-            f"the process that holds {self._name} is gone ({type(error).__name__})",
+            f"the process of {self._name} has ended ({type(error).__name__})",
             hint=self._gone_hint,
             device=self._name,
         )

@@ -90,7 +90,7 @@ class HostProcess:
             self._process.join(timeout=1.0)
             how = self._how_it_ended()
             text = f"the process of {name} died while starting ({how})"
-            error = DeviceUnavailable(text, hint="its last words are in the log above", device=name, **{EXIT: how})
+            error = DeviceUnavailable(text, hint="see its last messages in the log above", device=name, **{EXIT: how})
         if error is not None:
             self.close()
             raise error

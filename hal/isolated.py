@@ -23,9 +23,9 @@ FIRST_PAUSE_S = 0.5  # before the first restart; twice as long before each furth
 LONGEST_PAUSE_S = 5.0
 MAX_RESTARTS = 3  # of a driver that crashes again and again, within
 CRASHES_COUNT_S = 60.0
-SOON = "nothing to do: it connects again by itself; the log says how the driver crashed"
-BY_HAND = "mend it (the log says how the driver crashed), then connect it: PUT /v1/devices/NAME, or restart the service"
-CLEAR_THE_HAND = "when nothing is between the jaws connect it again: PUT /v1/devices/NAME, or restart the service"
+SOON = "nothing to do: it is connected again automatically; the log says how the driver crashed"
+BY_HAND = "correct the cause (the log says how the driver crashed), then run `panelwright devices connect NAME`"
+CLEAR_THE_HAND = "make sure that nothing is between the jaws, then run `panelwright devices connect NAME`"
 log = logging.getLogger(__name__)
 
 Report = Callable[[str, dict[str, Any]], None]
@@ -128,11 +128,12 @@ class IsolatedDevice:
         self._report("driver-down", {"device": self._name, "driver": self._driver, "exit": how})
         self._process.close()
         if self._constants.kind == DeviceKind.GRIPPER:
-            return self._stay_down(f"{crashed}; jaws may move when it connects, so that is left to you", CLEAR_THE_HAND)
+            why = "it is not restarted automatically, because its jaws may move when it connects"
+            return self._stay_down(f"{crashed}; {why}", CLEAR_THE_HAND)
         pause_s, last = self._pause_s, crashed
         self._crashes_s.append(time.monotonic())
         while not self._crashes_too_often():
-            self._down = (f"{last}; it is started again in {pause_s:g} s", SOON)
+            self._down = (f"{last}; it is restarted in {pause_s:g} s", SOON)
             if self._is_closed.wait(pause_s):
                 return False
             try:
@@ -140,7 +141,7 @@ class IsolatedDevice:
             except CellError as error:
                 if self._is_closed.is_set():
                     return False
-                last = f"{crashed} and does not connect again yet: {error.what}"
+                last = f"{crashed} and could not be connected again yet: {error.what}"
                 if EXIT in error.details:
                     self._crashes_s.append(time.monotonic())
                 pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
@@ -151,7 +152,9 @@ class IsolatedDevice:
             self._report("driver-restarted", {"device": self._name, "restarts": self._restarts})
             return True
         times = len(self._crashes_s)
-        return self._stay_down(f"{last}; {times} crashes within {CRASHES_COUNT_S:.0f} s, so it stays down", BY_HAND)
+        return self._stay_down(
+            f"{last}; {times} crashes within {CRASHES_COUNT_S:.0f} s, so it is not restarted again", BY_HAND
+        )
 
     def _crashes_too_often(self) -> bool:
         since_s = time.monotonic() - CRASHES_COUNT_S

@@ -80,7 +80,7 @@ def invert(information: Array) -> Array:
     diagonal = np.diag(information)
     if not (np.isfinite(information).all() and (diagonal > 0).all()):
         raise NotObservable(
-            "a parameter does not show in the data at all", hint="add views that differ more",
+            "the data do not depend on one of the parameters, so it cannot be determined", hint="add views that differ more",
             direction=[float(d <= 0) for d in diagonal],
         )  # fmt: skip
     scale = np.sqrt(diagonal)
@@ -88,7 +88,7 @@ def invert(information: Array) -> Array:
     if values[0] < 1e-12 * values[-1]:
         direction = vectors[:, 0] / scale
         raise NotObservable(
-            "the data leave a combination of the parameters free", hint="add views that differ more",
+            "the data do not determine one combination of the parameters", hint="add views that differ more",
             direction=(direction / np.abs(direction).max()).round(3).tolist(),
         )  # fmt: skip
     return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))

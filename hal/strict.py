@@ -68,7 +68,9 @@ def read_text(path: Path, what: str) -> str:
         raise ConfigError(f"{what} {path} does not exist", hint=hint, file=str(path)) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
-            f"{what} {path} cannot be read: {error}", hint="check path, rights and encoding (UTF-8)", file=str(path)
+            f"{what} {path} cannot be read: {error}",
+            hint="check path, permissions and encoding (UTF-8)",
+            file=str(path),
         ) from error
 
 

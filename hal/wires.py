@@ -66,13 +66,16 @@ def clash(one: ResourceClaim, other: ResourceClaim, *, apart: bool = False) -> t
     if one.same_wire != other.same_wire:
         return None
     if one.bus is None or other.bus is None:
-        return f"both want {one.wire}", "it serves one device: give one of them another"
+        return f"both use {one.wire}", "it can serve only one device: give one of the two another port or path"
     if apart and one.wire.startswith("serial "):
-        return f"share {one.wire}, but one of them is isolated", "devices of one serial bus live in one process"
+        return (
+            f"share {one.wire}, but one of them is isolated",
+            "devices on the same serial bus must run in the same process: remove isolate = true",
+        )
     if one.bus != other.bus:
         what = f"share {one.wire}, but one speaks {one.bus} and the other {other.bus}"
         return what, "one wire carries one protocol at one rate: correct the rate, or the port of one of them"
     both = [station for station in one.stations if station in other.stations]
     if not both or (one.shared_as is not None and one.shared_as == other.shared_as):
         return None
-    return f"both are {both[0]} on {one.wire} ({one.bus})", "each needs an address of its own on a bus they share"
+    return f"both are {both[0]} on {one.wire} ({one.bus})", "give each device on a shared bus its own address"

@@ -69,7 +69,9 @@ class SimArm(SimDevice[JointState]):
         wanted = np.asarray(position_rad, float)
         if wanted.shape != self._lower.shape or not math.isfinite(wanted @ wanted):
             raise InvalidRequest(
-                f"{self._name}: a set-point is six finite joint angles", hint="check the planner", device=self._name
+                f"{self._name}: a set-point must be six finite joint angles",
+                hint="check the planner that sent it",
+                device=self._name,
             )
         if not self._world.is_enabled:
             raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)

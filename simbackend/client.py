@@ -243,7 +243,11 @@ class WorldClient:
         with self._lock:
             truth = self._link.ask(Op.TRUTH, initial_s)
         if not isinstance(truth, Truth):
-            raise DeviceFault("the simulated world gave no truth", hint="report this", device="world")
+            raise DeviceFault(
+                "the simulated world did not return the true states",
+                hint="this is a defect: report it with the log",
+                device="world",
+            )
         return truth
 
     def close(self) -> None:
@@ -279,7 +283,7 @@ def _check_park(cell: Cell) -> None:
     if len(park) == DOF and all(a < q < b for a, q, b in zip(limits.lower_rad, park, limits.upper_rad, strict=True)):
         return
     raise ConfigError(
-        f"workspace.park_rad is no place for the arm {limits.model!r}: {list(park)}",
+        f"the arm {limits.model!r} cannot reach workspace.park_rad = {list(park)}",
         hint=f"give {DOF} joint angles within {list(limits.lower_rad)} and {list(limits.upper_rad)} rad",
         key="workspace.park_rad",
     )

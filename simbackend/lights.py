@@ -37,7 +37,7 @@ class SimLights(SimDevice[tuple[bool, ...]]):
         if len(on) != len(self._channels):
             raise InvalidRequest(
                 f"{self._name} has {len(self._channels)} channels, not {len(on)}",
-                hint="give one value a channel",
+                hint="give one value per channel",
                 device=self._name,
             )
         wanted = tuple(bool(x) for x in on)

@@ -177,6 +177,6 @@ def read_exactly(descriptor: int, count: int) -> bytes:
     while len(data) < count:
         more = os.read(descriptor, count - len(data))
         if not more:
-            raise EOFError("the other side of the pipe has gone")
+            raise EOFError("the process at the other end of the pipe has ended")
         data += more
     return data

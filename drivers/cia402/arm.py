@@ -65,7 +65,7 @@ class Cia402Options(CanOptions):
     def _one_node_a_joint(self) -> Self:
         require_stations("nodes", self.nodes, self.kinematics)
         if self.host_node in self.nodes:
-            raise ValueError(f"host_node {self.host_node} is one of the drives' nodes")
+            raise ValueError(f"host_node {self.host_node} is also in nodes: give it a number that no drive has")
         return self
 
     @property
@@ -326,8 +326,10 @@ class Cia402(StreamDevice[JointState]):
         if any(axis.state is DriveState.FAULT for axis in self._axes.values()):
             hint = "read object 603Fh; enable again resets the fault"
             return DeviceFault(f"{self.name}: a drive is in fault ({states})", hint=hint, device=self.name)
-        hint = "check power stage and enable inputs of the drives"
-        return DeviceTimeout(f"{self.name}: the drives do not follow ({states})", hint=hint, device=self.name)
+        hint = "check the power stage and the enable inputs of the drives"
+        return DeviceTimeout(
+            f"{self.name}: the drives were not enabled in time ({states})", hint=hint, device=self.name
+        )
 
     def lost(self, error: Exception) -> None:
         """Stop the motion and report the loss of the bus."""

@@ -87,7 +87,7 @@ class SdoClient:
         while True:
             answer = self._exchange(node, bytes([0x60 | toggle, *7 * [0]]), lambda a: a[0] >> 5 in (0, ABORTED))
             if answer is None or answer[0] & TOGGLE != toggle:
-                raise NoAnswer(f"node {node} ends a segmented transfer before its time")
+                raise NoAnswer(f"node {node} did not complete a segmented SDO transfer")
             self._checked(node, answer)
             data += answer[1 : 8 - (answer[0] >> 1 & 7)]
             if answer[0] & LAST:
@@ -171,7 +171,9 @@ class SetUp:
             if mapped != wanted:
                 what = f"node {node}: object {index:04X}h:{sub} maps {mapped:08X}, not {wanted:08X}"
                 raise Refused(
-                    what, code=index, hint="give its PDOs the mapping of docs/drivers.md with the maker's tool"
+                    what,
+                    code=index,
+                    hint="with the manufacturer's tool give its PDOs the mapping of docs/reference/drivers.md",
                 )
 
         return check

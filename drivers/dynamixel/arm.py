@@ -222,13 +222,17 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         if self._polls % (2 * WATCH_EVERY):
             torque = self._read_all(client, TORQUE, 1)
             if limp := [id_ for id_, data in torque.items() if not data[0]]:
-                raise Refused(f"servo {limp[0]} has lost its torque", code=0, hint="has it started again? enable again")
+                raise Refused(
+                    f"servo {limp[0]} has lost its torque",
+                    code=0,
+                    hint="check whether it has restarted, then enable the arm again",
+                )
             return
         limits = self._read_all(client, BUS_WATCHDOG, 1)
         tripped = [id_ for id_, data in limits.items() if data[0] == WATCHDOG_TRIPPED]
         if tripped:
             what = f"the bus watchdog of servo {tripped[0]} has tripped"
-            raise Refused(what, code=WATCHDOG_TRIPPED, hint="the bus was silent for too long; enable again")
+            raise Refused(what, code=WATCHDOG_TRIPPED, hint="the bus was silent for too long; enable the arm again")
 
     def fail(self, error: Exception) -> None:
         """Stop the motion after a servo's error report or the loss of the bus."""

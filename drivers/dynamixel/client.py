@@ -25,7 +25,7 @@ HARDWARE_ERROR, STATUS_RETURN = 70, 68
 ALWAYS = b"\x02"  # status return level: every instruction is answered
 PACKET_BYTES = 10  # header, id, length, instruction, CRC
 HARDWARE_BITS = {0: "supply voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
-REBOOT = "cure the cause, then switch the servo off and on: only a reboot helps"
+REBOOT = "remove the cause, then switch the servo's power off and on, because only a reboot clears this error"
 PROBES = range(1, 13)  # lengths of a read from address 0, where no servo has gaps
 
 
@@ -177,7 +177,8 @@ class DynamixelClient:
                     return found
         self._lost_in_a_row += 1
         self._note_late(odd)
-        what = f"{len(shape) - len(found)} of {len(shape)} answers of servos {', '.join(map(str, ids))} do not come"
+        missing = f"{len(shape) - len(found)} of {len(shape)} answers did not arrive"
+        what = f"servos {', '.join(map(str, ids))}: {missing}"
         if len(ids) == 1:
             what = f"servo {ids[0]} does not answer"
         self._why = what + "".join(f"; servo {x.id} sent {len(x.parameters)} bytes" for x in odd[:1])

@@ -114,7 +114,9 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
                 has_torque = client.read(o.id, TORQUE, 1, until_s)[0]
             if not has_torque:
                 raise DeviceFault(
-                    f"{self.name} has no torque", hint="connect it again: that switches it on", device=self.name
+                    f"the servo torque of {self.name} is off",
+                    hint="connect the gripper again, which switches the torque on",
+                    device=self.name,
                 )
             client.write(o.id, WATCHDOG, b"\x00", until_s)  # a tripped watchdog rejects goals
             client.write(o.id, GOAL_CURRENT, struct.pack("<h", current), until_s)
@@ -155,8 +157,8 @@ class DynamixelGripper(PolledDevice[GripperState, DynamixelClient]):
         if mode == GRIP_MODE:
             return
         if client.read(o.id, TORQUE, 1, until_s)[0]:
-            what = f"servo {o.id} is in mode {mode} under torque, not {GRIP_MODE} (grip)"
-            raise Refused(what, code=mode, hint="switch its torque off: then the driver sets the mode")
+            what = f"servo {o.id} is in mode {mode}, not {GRIP_MODE} (grip), and its torque is on"
+            raise Refused(what, code=mode, hint="switch its torque off, so that the driver can set the mode")
         client.write(o.id, MODE, bytes([GRIP_MODE]), until_s)
 
     def poll(self, client: DynamixelClient) -> None:

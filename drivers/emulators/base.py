@@ -82,7 +82,10 @@ class WireEmulator:
             Unsupported: the fault concerns the backing device, not the link.
         """
         if fault not in (None, Fault.SILENT, Fault.DISCONNECTED):
-            raise Unsupported(f"a wire cannot be {fault}", hint="inject it into the device behind the emulator")
+            raise Unsupported(
+                f"an emulator can make its link silent or disconnected, but not {fault}",
+                hint="inject this fault into the device that backs the emulator",
+            )
         self._is_silent = fault is Fault.SILENT
         is_out, self._is_out = self._is_out, fault is Fault.DISCONNECTED
         if self._is_out != is_out:

@@ -85,7 +85,10 @@ def frame(wrench: Wrench, status: int, stamp_us: int) -> bytes:
 def start(backing: Device, options: dict[str, Any]) -> BotaEmulator:
     """Start the emulator on a force/torque device (entry point `bota`)."""
     if not isinstance(backing, ForceTorque):
-        raise Unsupported(f"a SensONE cannot stand for a {backing.kind}", hint="back it with a force/torque device")
+        raise Unsupported(
+            f"the emulator of a SensONE force/torque sensor cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind force_torque as the emulator's backing device",
+        )
     emulator = BotaEmulator(backing, validate(options, BotaEmulatorOptions, source="emulators.bota"))
     emulator.begin()
     return emulator

@@ -221,7 +221,10 @@ class Cia402Emulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> Cia402Emulator:
     """Start the emulator on an arm (entry point `cia402`)."""
     if not isinstance(backing, Arm):
-        raise Unsupported(f"six drives cannot stand for a {backing.kind}", hint="back them with an arm")
+        raise Unsupported(
+            f"the emulator of an arm of CiA 402 drives cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind arm as the emulator's backing device",
+        )
     emulator = Cia402Emulator(backing, validate(options, Cia402EmulatorOptions, source="emulators.cia402"))
     emulator.begin()
     return emulator

@@ -205,7 +205,10 @@ class DynamixelEmulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> DynamixelEmulator:
     """Start the emulator on an arm (entry point `dynamixel`)."""
     if not isinstance(backing, Arm):
-        raise Unsupported(f"servos cannot stand for a {backing.kind}", hint="back them with an arm")
+        raise Unsupported(
+            f"the emulator of an arm of Dynamixel servos cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind arm as the emulator's backing device",
+        )
     emulator = DynamixelEmulator(backing, validate(options, FaultOptions, source="emulators.dynamixel"))
     emulator.begin()
     return emulator

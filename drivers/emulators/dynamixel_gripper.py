@@ -97,7 +97,10 @@ class DynamixelGripperEmulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> DynamixelGripperEmulator:
     """Start the emulator on a gripper (entry point `dynamixel_gripper`)."""
     if not isinstance(backing, Gripper):
-        raise Unsupported(f"a gripper cannot stand for a {backing.kind}", hint="back it with a gripper")
+        raise Unsupported(
+            f"the emulator of a Dynamixel gripper cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind gripper as the emulator's backing device",
+        )
     parsed = validate(options, FaultOptions, source="emulators.dynamixel_gripper")
     emulator = DynamixelGripperEmulator(backing, parsed)
     emulator.begin()

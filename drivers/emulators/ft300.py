@@ -88,7 +88,10 @@ def stream_frame(values: Sequence[int]) -> bytes:
 def start(backing: Device, options: dict[str, Any]) -> Ft300Emulator:
     """Start the emulator on a force/torque device (entry point `ft300`)."""
     if not isinstance(backing, ForceTorque):
-        raise Unsupported(f"an FT 300 cannot stand for a {backing.kind}", hint="back it with a force/torque device")
+        raise Unsupported(
+            f"the emulator of an FT 300 force/torque sensor cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind force_torque as the emulator's backing device",
+        )
     emulator = Ft300Emulator(backing, validate(options, FaultOptions, source="emulators.ft300"))
     emulator.begin()
     return emulator

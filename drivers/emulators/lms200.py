@@ -102,7 +102,10 @@ class Lms200Emulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> Lms200Emulator:
     """Start the emulator on a range scanner (entry point `lms200`)."""
     if not isinstance(backing, RangeScanner):
-        raise Unsupported(f"a scanner cannot stand for a {backing.kind}", hint="back it with a range scanner")
+        raise Unsupported(
+            f"the emulator of an LMS 200 scanner cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind range_scanner as the emulator's backing device",
+        )
     emulator = Lms200Emulator(backing, validate(options, Lms200EmulatorOptions, source="emulators.lms200"))
     emulator.begin()
     return emulator

@@ -82,7 +82,10 @@ class NetftEmulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> NetftEmulator:
     """Start the emulator on a force/torque device (entry point `netft`)."""
     if not isinstance(backing, ForceTorque):
-        raise Unsupported(f"a Net F/T cannot stand for a {backing.kind}", hint="back it with a force/torque device")
+        raise Unsupported(
+            f"the emulator of a Net F/T sensor cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind force_torque as the emulator's backing device",
+        )
     emulator = NetftEmulator(backing, validate(options, NetftEmulatorOptions, source="emulators.netft"))
     emulator.begin()
     return emulator

@@ -113,7 +113,10 @@ class Robotiq2FEmulator(ModbusFarSide):
 def start(backing: Device, options: dict[str, Any]) -> Robotiq2FEmulator:
     """Start the emulator on a gripper (entry point `robotiq_2f`)."""
     if not isinstance(backing, Gripper):
-        raise Unsupported(f"a gripper cannot stand for a {backing.kind}", hint="back it with a gripper")
+        raise Unsupported(
+            f"the emulator of a Robotiq 2F gripper cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind gripper as the emulator's backing device",
+        )
     emulator = Robotiq2FEmulator(backing, validate(options, Robotiq2FEmulatorOptions, source="emulators.robotiq_2f"))
     emulator.begin()
     return emulator

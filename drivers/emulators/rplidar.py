@@ -129,7 +129,10 @@ def encode_capsules(range_m: np.ndarray[Any, Any], *, is_first: bool) -> bytes:
 def start(backing: Device, options: dict[str, Any]) -> RplidarEmulator:
     """Start the emulator on a range scanner (entry point `rplidar`)."""
     if not isinstance(backing, RangeScanner):
-        raise Unsupported(f"a scanner cannot stand for a {backing.kind}", hint="back it with a range scanner")
+        raise Unsupported(
+            f"the emulator of an RPLIDAR scanner cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind range_scanner as the emulator's backing device",
+        )
     emulator = RplidarEmulator(backing, validate(options, RplidarEmulatorOptions, source="emulators.rplidar"))
     emulator.begin()
     return emulator

@@ -154,7 +154,10 @@ def _listing(echo: str, values: Mapping[str, str | int]) -> bytes:
 def start(backing: Device, options: dict[str, Any]) -> ScipEmulator:
     """Start the emulator on a range scanner (entry point `scip`)."""
     if not isinstance(backing, RangeScanner):
-        raise Unsupported(f"a scanner cannot stand for a {backing.kind}", hint="back it with a range scanner")
+        raise Unsupported(
+            f"the emulator of a SCIP scanner cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind range_scanner as the emulator's backing device",
+        )
     emulator = ScipEmulator(backing, validate(options, ScipEmulatorOptions, source="emulators.scip"))
     emulator.begin()
     return emulator

@@ -61,7 +61,8 @@ class Scripted:
             DeviceTimeout: the deadline is past.
         """
         if deadline.is_past():
-            raise DeviceTimeout(f"{self.name} was asked too late", hint="give it more time", device=self.name)
+            what = f"{self.name} was read after the deadline of the call"
+            raise DeviceTimeout(what, hint="give the call a later deadline", device=self.name)
         self.reads += 1
         return self.reads, self._clock.now_s()
 

@@ -86,7 +86,10 @@ def _sum_is_right(frame: bytes) -> bool:
 def start(backing: Device, options: dict[str, Any]) -> TfminiEmulator:
     """Start the emulator on a proximity device (entry point `tfmini`)."""
     if not isinstance(backing, Proximity):
-        raise Unsupported(f"a tfmini cannot stand for a {backing.kind}", hint="back it with a proximity device")
+        raise Unsupported(
+            f"the emulator of a TFmini distance sensor cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind proximity as the emulator's backing device",
+        )
     emulator = TfminiEmulator(backing, validate(options, TfminiEmulatorOptions, source="emulators.tfmini"))
     emulator.begin()
     return emulator

@@ -116,7 +116,10 @@ class CanTfminiEmulator(WireEmulator):
 
 def _measurement(backing: Device, options: dict[str, Any]) -> tuple[Measurement, TfminiIOptions]:
     if not isinstance(backing, Proximity):
-        raise Unsupported(f"a tfmini cannot stand for a {backing.kind}", hint="back it with a proximity device")
+        raise Unsupported(
+            f"the emulator of a TFmini-i distance sensor cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind proximity as the emulator's backing device",
+        )
     parsed = validate(options, TfminiIOptions, source="emulators.tfmini_i")
     return Measurement(backing, parsed), parsed
 

@@ -278,7 +278,10 @@ class UrEmulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> UrEmulator:
     """Start the emulator on an arm (entry point `ur`)."""
     if not isinstance(backing, Arm):
-        raise Unsupported(f"a robot arm cannot stand for a {backing.kind}", hint="back it with an arm")
+        raise Unsupported(
+            f"the emulator of a UR arm cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind arm as the emulator's backing device",
+        )
     emulator = UrEmulator(backing, validate(options, UrEmulatorOptions, source="emulators.ur"))
     emulator.begin()
     return emulator

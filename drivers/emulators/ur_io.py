@@ -99,7 +99,10 @@ class UrIoEmulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> UrIoEmulator:
     """Start the emulator on lights or touch pads (entry point `ur_io`)."""
     if not isinstance(backing, Lights | Touch):
-        raise Unsupported(f"digital points cannot stand for a {backing.kind}", hint="back them with lights or touch")
+        raise Unsupported(
+            f"the emulator of the digital points of a UR controller cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind lights or touch as the emulator's backing device",
+        )
     emulator = UrIoEmulator(backing, validate(options, FaultOptions, source="emulators.ur_io"))
     emulator.begin()
     return emulator

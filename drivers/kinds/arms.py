@@ -57,7 +57,9 @@ def require_stations(what: str, stations: Sequence[int], k: KinematicsOptions) -
         ValueError: the check fails; `what` is the key that lists the stations.
     """
     if len(stations) != len(k.links) or len(set(stations)) != len(stations):
-        raise ValueError(f"{what} must be {len(k.links)} different ones, as kinematics has {len(k.links)} links")
+        raise ValueError(
+            f"{what} must be {len(k.links)} different numbers, because kinematics has {len(k.links)} links"
+        )
 
 
 def kinematics_of(c: ArmCapabilities) -> dict[str, Any]:
@@ -143,7 +145,7 @@ class SetPointFilter:
         if self._closings != closings:
             raise MotionRefused(
                 f"{self._name}: stopped, or its link lost, while the drives were being enabled",
-                hint="look at the arm, then command again",
+                hint="check the arm, then send the command again",
                 device=self._name,
             )
 
@@ -180,8 +182,8 @@ class SetPointFilter:
         wanted = np.asarray(wanted_rad, dtype=float)
         if wanted.shape != self._lower.shape or not np.all(np.isfinite(wanted)):
             raise InvalidRequest(
-                f"{self._name}: a set-point is {len(self._lower)} finite joint angles",
-                hint="check the planner",
+                f"{self._name}: a set-point must be {len(self._lower)} finite joint angles",
+                hint="check the planner that sent it",
                 device=self._name,
             )
         with self._passing:

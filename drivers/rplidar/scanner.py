@@ -39,7 +39,7 @@ SPIN_UP_S = 2.5  # before the first measurement
 TURN_S = 3.0  # restart when measurements arrive but no whole turn for this long
 CONNECT_S = 6.0
 SEND_S, QUIET_S = 0.3, 0.3
-OLD_FIRMWARE = '; the first A1 models know no express scans: set mode = "standard"'
+OLD_FIRMWARE = '; the oldest A1 models do not support express scans: for them set mode = "standard"'
 
 
 class RplidarOptions(SerialOptions):
@@ -176,7 +176,7 @@ class Rplidar(LineScanner):
             drain_until_quiet(link, quiet_s=0.1, until_s=now_s() + RESET_S)
             status, code = self._health(link)
             if status == ERROR:
-                raise Refused(f"the scanner reports error {code:04X}h, which a reset does not cure", code=code)
+                raise Refused(f"the scanner reports error {code:04X}h, which a reset did not clear", code=code)
         self._quality = Quality.DEGRADED if status == WARNING else Quality.VALID
         self._nodes, self._capsules, self._turn, self._begun = NodeParser(), CapsuleParser(), None, None
         self._turn_s = now_s() + SPIN_UP_S
@@ -225,7 +225,9 @@ class Rplidar(LineScanner):
                     self._turn.append((angle_rad[part], distance_m[part]))
                 behind -= len(part)
         if arrived_s > self._turn_s + TURN_S:
-            raise NoAnswer(f"measurements come, but no whole turn in {TURN_S:.0f} s; does its motor turn steadily?")
+            raise NoAnswer(
+                f"measurements arrive, but no complete turn in {TURN_S:.0f} s; check that its motor turns steadily"
+            )
 
     def _starts(self, angle_rad: Array) -> list[int]:
         starts = split_turns(angle_rad, self._last_rad)

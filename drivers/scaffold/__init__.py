@@ -43,9 +43,11 @@ def new_driver(
     """
     for word in (name, package or name):
         if not NAME.fullmatch(word):
-            raise ConfigError(f"{word!r} is no module name", hint="small letters, digits and underscores")
+            raise ConfigError(f"{word!r} is not a module name", hint="use lower-case letters, digits and underscores")
     if kind not in KINDS:
-        hint = f"templates: {', '.join(KINDS)}; for others start from the nearest driver in drivers/"
+        hint = (
+            f"templates: {', '.join(KINDS)}; for other kinds begin with a copy of the most similar driver in drivers/"
+        )
         raise ConfigError(f"there is no template for kind {kind}", hint=hint)
     if transport not in WIRES:
         raise ConfigError(f"there is no template for {transport!r}", hint=f"transports: {', '.join(WIRES)}")

@@ -47,11 +47,11 @@ class KindText:
 
 def _sensor(protocol: str, value: str, read: str, capabilities: str) -> str:
     return f'''    def capabilities(self) -> {protocol}Capabilities:
-        """The maker's figures."""
+        """Return the figures of the manufacturer's data sheet."""
         return {capabilities}
 
     def {read}(self, *, deadline: Deadline) -> Stamped[{value}]:
-        """The newest sample."""
+        """Return the newest sample."""
         return self.newest(deadline)
 
 '''
@@ -154,7 +154,7 @@ ANGLES_RAD = BEAMS.first_rad + STEP_RAD * np.arange(BEAMS.count)
         base="StreamDevice[tuple[bool, ...]]",
         members=_kind(DeviceKind.LIGHTS),
         methods='''    def capabilities(self) -> LightsCapabilities:
-        """The maker's figures."""
+        """Return the figures of the manufacturer's data sheet."""
         return LightsCapabilities(channels=("upper left", "upper right", "lower right", "lower left"), settle_s=0.05)
 
     def set_on(self, on: Sequence[bool], *, deadline: Deadline) -> tuple[bool, ...]:
@@ -162,7 +162,7 @@ ANGLES_RAD = BEAMS.first_rad + STEP_RAD * np.arange(BEAMS.count)
         link = self.port.link
         if len(on) != CHANNELS:
             what = f"{self.name} has {CHANNELS} channels, not {len(on)}"
-            raise InvalidRequest(what, hint="give one value a channel")
+            raise InvalidRequest(what, hint="give one value per channel")
         self.require_open()
         try:
             if link is None:
@@ -173,7 +173,7 @@ ANGLES_RAD = BEAMS.first_rad + STEP_RAD * np.arange(BEAMS.count)
         return tuple(map(bool, on))
 
     def read_on(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
-        """The newest feedback."""
+        """Return the newest feedback."""
         return self.newest(deadline)
 
 ''',
@@ -193,7 +193,7 @@ def command(on: Sequence[bool]) -> bytes:
         far_methods='''        self._commands = Framer(b"\\xa5\\xc0", 4, lambda frame: sum_low_byte(frame[:-1]) == frame[-1])
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:  # noqa: ARG002  # whoever sends, commands
-        """Switch as told."""
+        """Switch the lights as each command asks."""
         for frame in self._commands.feed(data):
             on = [bool(frame[2] >> i & 1) for i in range(CHANNELS)]
             self._backing.set_on(on, deadline=self.deadline())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from string import Template
 
-DRIVER = Template('''"""$title: what it measures, over which wire, by which document of its maker."""
+DRIVER = Template('''"""Driver of $title: say what it measures, over which wire, and which manual describes its protocol."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def framer() -> Framer:
 
 
 class $cls($base):
-    """The device."""
+    """Driver of $title."""
 
 $members
     def __init__(self, context: Context, options: ${cls}Options) -> None:
@@ -35,13 +35,13 @@ $members
         self._counter: int | None = None
 
 ${methods}    def start(self, link: Link) -> None:
-        """Stop, identify, configure, start, as if the device had been left in any state; this one needs none of it."""
+        """Bring the device from any state to streaming: stop, identify, configure, start. This one needs none of it."""
         drain(link)
         self._framer.reset()
         self._counter = None
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each whole frame; the counter tells lost and repeated ones."""
+        """Publish each complete frame; its counter shows which frames were lost or repeated."""
         for frame in self._framer.feed(chunk):
             _, counter, *numbers, _ = FRAME.unpack(frame)
             gap = 1 if self._counter is None else (counter - self._counter) % 256
@@ -60,7 +60,7 @@ def connect(context: Context, options: dict[str, Any]) -> $cls:
     return device
 ''')
 
-EMULATOR = Template('''"""The far side of $title, worked by any $kind device."""
+EMULATOR = Template('''"""Emulator of $title, backed by any device of kind $kind."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ $far_imports
 
 
 class ${cls}Emulator(WireEmulator):
-    """The device, running."""
+    """Running emulator at the other end of the driver's link."""
 
     period_s = 1.0 / RATE_HZ
 
@@ -78,7 +78,7 @@ class ${cls}Emulator(WireEmulator):
         self._counter = 0
 $far_methods
     def on_tick(self) -> None:
-        """One frame."""
+        """Send one frame with the newest sample of the backing device."""
         sample = self._backing.$read(deadline=self.deadline())
         values = $encode
         numbers = [round(1000.0 * value) for value in values]
@@ -90,7 +90,10 @@ $far_methods
 def start(backing: Device, options: dict[str, Any]) -> ${cls}Emulator:
     """Entry point `$name` in the group `panelwright.emulators`."""
     if not isinstance(backing, $protocol):
-        raise Unsupported(f"$name cannot stand for a {backing.kind}", hint="back it with a $kind device")
+        raise Unsupported(
+            f"the emulator of $title cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind $kind as the emulator's backing device",
+        )
     emulator = ${cls}Emulator(backing, validate(options, FaultOptions, source="emulators.$name"))
     emulator.begin()
     return emulator

@@ -125,10 +125,10 @@ class Bus(Generic[C]):
         finally:
             self._callers.pop()
         if not is_ours:
-            raise NoAnswer(f"bus {self.name} stays busy")
+            raise NoAnswer(f"bus {self.name} was busy until the deadline")
         try:
             if self._client is None:
-                raise LinkLost(f"bus {self.name} is down")
+                raise LinkLost(f"bus {self.name} is not connected")
             return work(self._client, until_s)
         finally:
             self._lock.release()
@@ -176,7 +176,7 @@ class Bus(Generic[C]):
 
     def _serve(self, slot: _Slot[C]) -> None:
         if self._client is None:
-            raise LinkLost(f"bus {self.name} is down")
+            raise LinkLost(f"bus {self.name} is not connected")
         if slot.needs_set_up:
             slot.station.set_up(self._client)
             slot.needs_set_up = False
@@ -192,7 +192,7 @@ class Bus(Generic[C]):
             slot.needs_set_up = True
         slot.station.fail(error)
         if isinstance(error, NoAnswer) and not link.is_present():
-            raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
+            raise LinkLost(f"{link.name}: its path no longer exists or now leads to another port")
 
     def lost(self, error: Exception) -> None:
         """Report the loss to every station (owner thread)."""

@@ -148,7 +148,7 @@ def read_capture(path: Path) -> list[PortRecording]:
         except (ValueError, KeyError, TypeError) as error:
             if number == len(lines):
                 break  # the writer was killed in the middle of a line
-            what = f"{path}, line {number} is no line of a capture: {error!r}"
+            what = f"{path}, line {number} is not a line of a capture: {error!r}"
             raise ConfigError(what, hint="give a file that `capture` has written") from error
     return [PortRecording(name, byte_s, tuple(events)) for name, byte_s, events in sessions]
 
@@ -194,7 +194,7 @@ class ReplayLink:
                     self._events.pop()
                     if event.is_read:
                         return event.data
-            raise RecordingEnded(f"{self._name} is at its end")
+            raise RecordingEnded(f"{self._name} has ended")
 
     def write(self, data: bytes, until_s: float) -> None:  # noqa: ARG002  # a file accepts any data at once
         """Release the data that was read after the same bytes were written in the recording."""
@@ -231,7 +231,10 @@ def replay_opener(path: Path, device: str) -> Callable[[], Link]:
 
     def opened() -> Link:
         if not sessions:
-            what, hint = f"{device}: the recording {path.name} is at its end", "connect again to see it again"
+            what, hint = (
+                f"{device}: the recording {path.name} has ended",
+                "connect the device again to replay it from the beginning",
+            )
             raise DeviceUnavailable(what, hint=hint, device=device, recording="ended")
         return ReplayLink(sessions.popleft())
 

@@ -17,10 +17,10 @@ from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 
 T = TypeVar("T")
-NOT_A_BYTE = "not one byte has come: check power, cable and that the port leads to this device"
+NOT_A_BYTE = "no byte has arrived: check power and cable, and that the port leads to this device"
 BYTES_WITHOUT_SENSE = (
-    "bytes come but none that fit: another device or address, or on a serial line another baud rate, which "
-    "`panelwright doctor` finds"
+    "bytes arrive, but none of them form a valid answer: the device, its address or, on a serial line, the baud rate is "
+    "not the configured one; `panelwright doctor` finds the baud rate"
 )
 SLICE_S = 0.02  # longest wait of a stream reader, so that close() returns soon
 CONNECT_S = 3.0  # a set-up whose first answers are lost needs several attempts
@@ -160,9 +160,9 @@ class WireDevice(Generic[T]):
         if isinstance(error, Refused):
             return DeviceFault(f"{self.name}: {error}", hint=error.hint, code=error.code, **where)
         if isinstance(error, LinkLost):
-            hint = "plug it in; it reconnects by itself"
+            hint = "plug the device in; it is connected again automatically"
             if isinstance(error, RecordingEnded):
-                hint = "this was all that was recorded"
+                hint = "nothing more was recorded; connect the device again to replay the recording"
             return DeviceUnavailable(f"{self.name} is disconnected: {error}", hint=hint, **where)
         return DeviceTimeout(f"{self.name}: {error}", hint=self._silence_hint(), counts=self.wire_counts(), **where)
 

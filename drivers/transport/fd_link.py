@@ -49,7 +49,7 @@ class FdLink:
         except (OSError, ValueError) as error:
             raise LinkLost(f"{self._name}: {error}") from error
         if not data:
-            raise LinkLost(f"{self._name}: the far side hung up")
+            raise LinkLost(f"{self._name}: the other end closed the connection")
         self.received += len(data)
         return data
 
@@ -78,7 +78,7 @@ class FdLink:
     def write(self, data: bytes, until_s: float) -> None:
         """Send all of `data` before `until_s`."""
         if not self._write_lock.acquire(timeout=max(0.0, until_s - now_s())):
-            raise NoAnswer(f"{self._name}: another write blocks the port")
+            raise NoAnswer(f"{self._name}: another write still blocks the port")
         try:
             self._write_all(data, until_s)
         except (OSError, ValueError) as error:
@@ -94,7 +94,7 @@ class FdLink:
             except BlockingIOError:
                 wait_s = until_s - now_s()
                 if wait_s <= 0.0 or not self._poll_out.poll(wait_s * 1e3):
-                    raise NoAnswer(f"{self._name}: the port takes no more bytes") from None
+                    raise NoAnswer(f"{self._name}: the port accepts no more bytes") from None
 
     def is_present(self) -> bool:
         """Return True: a socket has no path that could vanish; serial ports override this."""

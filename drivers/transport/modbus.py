@@ -24,18 +24,18 @@ EXCEPTIONS = {
     4: "device failure",
     5: "accepted, still working",
     6: "device busy",
-    10: "gateway has no path",
-    11: "gateway target does not answer",
+    10: "gateway has no path to the device",
+    11: "device behind the gateway does not answer",
 }
 BUSY = (5, 6)
 BUSY_REST_S = 0.01
 HINTS = {
-    1: "it lacks a function that the driver needs: is it the right device?",
-    2: "it has fewer points or other registers than the options say",
-    3: "it has fewer points or other registers than the options say",
-    4: "look at the device itself",
-    10: "check unit and wiring behind the gateway",
-    11: "check unit and wiring behind the gateway",
+    1: "the device lacks a function that the driver needs: is it the right device?",
+    2: "the device has fewer points, or other registers, than its options say",
+    3: "the device has fewer points, or other registers, than its options say",
+    4: "the device reports a failure of its own: check its display and its manual",
+    10: "check the unit number, and the wiring behind the gateway",
+    11: "check the unit number, and the wiring behind the gateway",
 }
 RTU_GAP_S = 0.00175  # 3.5 characters above 19200 baud (Modbus over serial line V1.02, 2.5.1.1)
 
@@ -238,7 +238,10 @@ class ModbusRtu(ModbusMaster):
             raise self._silence(b"", unit)
         self.late_bytes += drain_until_quiet(self._link, quiet_s=self._timeout_s, until_s=until_s)
         if now_s() >= until_s:
-            raise NoAnswer(f"{self._link.name}, unit {unit}: answers that are too late still come")
+            late = (
+                f"late answers to earlier requests still arrive; `timeout_s` = {self._timeout_s:g} s may be too short"
+            )
+            raise NoAnswer(f"{self._link.name}, unit {unit}: {late}")
         self._unanswered = {lost for lost in self._unanswered if lost[0] != unit}
 
     def _probe(self, unit: int, function: int, until_s: float) -> None:

@@ -80,7 +80,7 @@ class StreamDevice(PortDevice[T]):
         self.take_in(link, now_s() + self.keep_going(link))
         silent_s = now_s() - self._heard_s
         if silent_s > 3 * SLICE_S and not link.is_present():
-            raise LinkLost(f"{link.name}: its name has vanished or leads to another port")
+            raise LinkLost(f"{link.name}: its path no longer exists or now leads to another port")
         if silent_s > max(self._silence_s, self.max_age_s):
             raise NoAnswer(f"no valid data for {silent_s:.2f} s; {self.wire_counts()}")
 

@@ -251,7 +251,7 @@ class Ur(StreamDevice[JointState]):
         link, inputs = self.port.link, self._session.inputs
         try:
             if link is None or inputs is None:
-                raise LinkLost("RTDE is down")
+                raise LinkLost("the RTDE connection is down")
             counts = [round(q / RAD_PER_COUNT) for q in position_rad]
             link.write(inputs.pack([self._beat % 2**31, *counts]), wall_until(deadline))
         except WireError as error:

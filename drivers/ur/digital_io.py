@@ -168,7 +168,7 @@ class UrLights(UrIo):
     def _switch(self, link: Link, wanted: Bits, until_s: float) -> None:
         orders = self._session.inputs
         if orders is None:
-            raise LinkLost("the controller is not set up")
+            raise LinkLost("the RTDE session with the controller is not set up yet")
         mask = sum(1 << output for output in self._options.outputs)
         word = sum(1 << output for output, is_on in zip(self._options.outputs, wanted, strict=True) if is_on)
         with self._writing:

@@ -60,7 +60,7 @@ class Rig(Generic[D]):
     def begin(self, fault: Fault) -> None:
         """Inject a fault, or skip the test if the backend cannot."""
         if self.inject is None:
-            pytest.skip(f"this rig has no way to make a device {fault}")
+            pytest.skip(f"this rig cannot make a device {fault}")
         self.inject(fault)
 
     def end_faults(self) -> None:

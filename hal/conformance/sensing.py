@@ -59,7 +59,7 @@ class RangeScannerContract(DeviceContract[RangeScanner]):
     def test_a_line_scanner_keeps_every_scan_of_a_recording(self, rig: Rig[RangeScanner]) -> None:
         c = rig.device.capabilities()
         if not c.needs_sweep:
-            pytest.skip("it gives whole images")
+            pytest.skip("the scanner returns whole images and records no single scans")
         assert isinstance(rig.device, SweptScanner)
         rig.device.start_recording(deadline=rig.deadline())
         began_s = rig.clock.now_s()

@@ -110,4 +110,4 @@ class PanelObject(Strict, ABC):
     @classmethod
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
         """Return the keys of its table in a panel file, except kind, name and position, from what was taught."""
-        raise NotImplementedError(f"nothing is known of how to teach a {cls.__name__}")
+        raise NotImplementedError(f"a {cls.__name__} cannot be taught: its model does not define `keys_of`")

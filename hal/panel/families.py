@@ -112,9 +112,9 @@ def about_digits(digits: str, most: str, look: Question) -> tuple[Question, ...]
     """
     return (
         Question(key="digits", text="How many digits?", default=digits),
-        Question(key="decimals", text="How many of them after the point?", default="0"),
+        Question(key="decimals", text="How many of them are after the decimal point?", default="0"),
         look,
         Question(key="unit", text="In which unit?"),
-        Question(key="minimum", text="What is the least that it can show?", default="0"),
-        Question(key="maximum", text="What is the most?", default=most),
+        Question(key="minimum", text="What is the smallest value that it can show?", default="0"),
+        Question(key="maximum", text="What is the largest value that it can show?", default=most),
     )

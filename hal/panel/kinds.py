@@ -23,8 +23,8 @@ READERS = "panelwright.readers"
 SKILLS = "panelwright.skills"
 BODIES = "panelwright.bodies"
 LACKS = {
-    READERS: ("a reader", "it can be found, not read"),
-    SKILLS: ("a skill", "it is read only"),
+    READERS: ("a reader", "it can be located but not read"),
+    SKILLS: ("a skill", "it can be read but not operated"),
     BODIES: ("a simulated body", "it is not simulated: use a panel without it, or a real cell"),
 }
 

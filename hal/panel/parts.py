@@ -48,15 +48,17 @@ class Scale(Strict):
         if self.maximum <= self.minimum:
             raise meant_otherwise(
                 f"maximum must be greater than minimum, and {self.maximum:g} is not greater than {self.minimum:g}",
-                "swap them; a scale that falls has its at_min and at_max swapped instead",
+                "swap them; if the values decrease along the scale, swap at_min and at_max instead",
             )
         if self.at_max == self.at_min:
-            raise meant_otherwise(f"at_max must differ from at_min, and both are {self.at_min:g}", "give both ends")
+            raise meant_otherwise(
+                f"at_max must differ from at_min, and both are {self.at_min:g}", "give the position of each end"
+            )
         steps = [(p1 - p0, v1 - v0) for (p0, v0), (p1, v1) in pairwise(self._points())]
         if any(place == 0.0 or value == 0.0 or (value > 0.0) != (steps[0][1] > 0.0) for place, value in steps):
             raise meant_otherwise(
                 "the values of a scale and its table must all rise, or all fall, from place to place",
-                "look for a pair of the table that stands on the wrong side of its neighbours",
+                "correct the pair of the table that is out of order with its neighbours",
             )
         return self
 

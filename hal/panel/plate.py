@@ -64,7 +64,7 @@ def _off_the_plate(width_m: float, height_m: float, parts: Parts) -> Iterator[In
             yield fault((*at, "position_m"), part.position_m, what, f"{plate}: move it")
         elif (over := max(abs(x) + half_x - width_m / 2, abs(y) + half_y - height_m / 2)) > OVERLAP_M:
             what = f"{part.name} at ({x}, {y}) m reaches {1e3 * over:.0f} mm beyond the plate"
-            yield fault((*at, "position_m"), part.position_m, what, f"{plate}: move it, or mend its sizes")
+            yield fault((*at, "position_m"), part.position_m, what, f"{plate}: move it, or correct its sizes")
 
 
 def _overlapping(parts: Parts) -> Iterator[InitErrorDetails]:
@@ -72,8 +72,8 @@ def _overlapping(parts: Parts) -> Iterator[InitErrorDetails]:
     for one, other in combinations(parts, 2):
         depth = _depth_m(feet[one], feet[other])
         if depth > OVERLAP_M:
-            what = f"{parts[other].name} stands {1e3 * depth:.0f} mm in {parts[one].name}"
-            yield fault((*other, "position_m"), parts[other].position_m, what, "move one of them, or mend its sizes")
+            what = f"{parts[other].name} overlaps {parts[one].name} by {1e3 * depth:.0f} mm"
+            yield fault((*other, "position_m"), parts[other].position_m, what, "move one of them, or correct its sizes")
 
 
 def _without_lamp(parts: Parts) -> Iterator[InitErrorDetails]:
@@ -81,7 +81,7 @@ def _without_lamp(parts: Parts) -> Iterator[InitErrorDetails]:
     for at, part in parts.items():
         lit = getattr(part, "lights_lamp", None)
         if lit is not None and lit not in lamps:
-            what = f"{part.name} lights {lit!r}, which is no lamp of the panel"
+            what = f"{part.name} lights {lit!r}, which is not a lamp of the panel"
             yield fault((*at, "lights_lamp"), lit, what, f"lamps: {', '.join(sorted(lamps)) or 'none'}")
 
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 COLOURS = ("green", "red", "amber", "blue", "white")
 MARKS = "degrees clockwise from straight up, or x,y of a pixel on the mark"
-PLACES = "Its places: name=degrees clockwise from straight up, separated by commas?"
+PLACES = "What are its positions (name=degrees clockwise from straight up, separated by commas)?"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,7 +32,10 @@ class Slider(PanelObject):
     asked: ClassVar[tuple[Question, ...]] = (
         *ENDS,
         Question(
-            key="rises", text="Where does the value rise to?", choices=("right", "left", "up", "down"), default="right"
+            key="rises",
+            text="In which direction does the value increase?",
+            choices=("right", "left", "up", "down"),
+            default="right",
         ),
     )
 
@@ -41,7 +44,10 @@ class Slider(PanelObject):
         """Check that the scale's positions are metres along the track."""
         faults = [
             fault(
-                ("scale", key), place, f"{place:g} m is beyond the track", f"the track ends {self.travel_m / 2:g} m off"
+                ("scale", key),
+                place,
+                f"{place:g} m is beyond the track",
+                f"the track ends {self.travel_m / 2:g} m from its middle",
             )
             for key, place in (("at_min", self.scale.at_min), ("at_max", self.scale.at_max))
             if abs(place) > 0.501 * self.travel_m

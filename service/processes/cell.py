@@ -154,7 +154,7 @@ class FarSide:
 
 
 def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Callable[[], None]]) -> dict[str, FarSide]:
-    """Start the emulator of each emulated wire; returns the far sides by device name."""
+    """Start the emulator of each emulated wire; returns the emulators by device name."""
     far_sides: dict[str, FarSide] = {}
     for name, section in cell.file.emulators.items():
         key = f"emulators.{name}"

@@ -133,7 +133,11 @@ class Chatter:
 
 @pytest.mark.parametrize(
     ("way", "hint"),
-    [("silent", "not one byte"), ("noise", "bytes come but none that fit"), ("missing", "plug the device in")],
+    [
+        ("silent", "no byte has arrived"),
+        ("noise", "bytes arrive, but none of them form a valid answer"),
+        ("missing", "plug the device in"),
+    ],
 )
 def test_every_serial_driver_says_what_is_wrong_with_its_port(
     way: str, hint: str, caplog: Any, monkeypatch: pytest.MonkeyPatch

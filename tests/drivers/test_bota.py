@@ -153,7 +153,7 @@ def test_a_refused_filter_is_told_as_that() -> None:
 def test_a_power_up_text_that_comes_in_two_pieces_is_seen() -> None:
     device = Bota(Context(name="wrist"), BotaOptions(port="none"))
     device.receive(b"\xaa\x00App I", 0.0)
-    with pytest.raises(NoAnswer, match="started anew"):
+    with pytest.raises(NoAnswer, match="has restarted"):
         device.receive(b"nit\r\n", 0.0)
 
 

@@ -146,7 +146,7 @@ def test_a_broken_or_odd_picture_is_a_fault_that_names_it(folder: Path) -> None:
 def test_a_damaged_depth_picture_is_a_fault_that_names_the_file(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     lens = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
-    with pytest.raises(DeviceFault, match=rf"{name} is no depth picture"):
+    with pytest.raises(DeviceFault, match=rf"{name} is not a depth picture"):
         connect(Context(name="depth"), "files:depth", {"path": str(tmp_path), **lens})
 
 

@@ -144,9 +144,9 @@ def test_the_switch_knows_near_and_says_nothing_of_far() -> None:
     ("driver", "options", "message"),
     [
         ("modbus:lights", {"outputs": [0, 1]}, "same number"),
-        ("modbus:lights", {"feedback": [0, 1, 2, 9]}, "only 8 inputs"),
+        ("modbus:lights", {"feedback": [0, 1, 2, 9]}, "only inputs 0 to 7"),
         ("modbus:touch", {"contacts": [4]}, "same number"),
-        ("modbus:proximity", {"input": 12}, "only 8 inputs"),
+        ("modbus:proximity", {"input": 12}, "only inputs 0 to 7"),
         ("modbus:lights", {"unit": 300}, r"options: unit"),
     ],
 )

@@ -121,7 +121,7 @@ def test_measurements_without_a_whole_turn_are_told() -> None:
     device = Rplidar(Context(name="scanner"), RplidarOptions(port="none"))
     piece = emulator.encode_turn(TURN_RAD, np.full(360, 1.0))[10:500]
     device.receive(piece, now_s())
-    with pytest.raises(NoAnswer, match="no whole turn in 3 s; does its motor turn"):
+    with pytest.raises(NoAnswer, match="no complete turn in 3 s; check that its motor turns"):
         device.receive(piece, now_s() + 60.0)
 
 
@@ -141,7 +141,7 @@ def test_firmware_without_express_scans_is_told() -> None:
 def test_an_incurable_scanner_is_told() -> None:
     far_side = emulator.start(ScriptedScanner(), {"health": 2, "is_cured_by_reset": False})
     try:
-        with pytest.raises(DeviceUnavailable, match="error 0000h, which a reset does not cure"):
+        with pytest.raises(DeviceUnavailable, match="error 0000h, which a reset did not clear"):
             connect(Context(name="scanner"), DRIVER, far_side.address)
     finally:
         far_side.close()

@@ -133,7 +133,7 @@ def test_a_button_lights_lamps_only(cell_path: Path, lit: str) -> None:
     panel = cell_path.parents[1] / "panels/tiny.toml"
     button = f'kind = "button"\nname = "start"\nposition_m = [0.1, 0.0]\nradius_m = 0.01\nlights_lamp = "{lit}"\n'
     panel.write_text(f"{PANEL}[[objects]]\n{button}")
-    with pytest.raises(ConfigError, match=f"start lights '{lit}', which is no lamp"):
+    with pytest.raises(ConfigError, match=f"start lights '{lit}', which is not a lamp"):
         load_panel(panel)
 
 

@@ -101,7 +101,7 @@ def test_a_hung_object_is_a_timeout_and_the_next_call_is_answered(host: HostProc
 
 def test_an_answer_that_cannot_travel_is_a_defect_and_the_host_lives(host: HostProcess) -> None:
     proxy = host.proxy("calculator")
-    with pytest.raises(RuntimeError, match="cannot leave the process"):
+    with pytest.raises(RuntimeError, match="cannot be sent to another process"):
         proxy.lock()
     assert proxy.double(np.ones(1)).value[0] == 2.0
 

@@ -1,4 +1,4 @@
-"""rangefinder: what it measures, over which wire, by which document of its maker."""
+"""Driver of rangefinder: say what it measures, over which wire, and which manual describes its protocol."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def framer() -> Framer:
 
 
 class Rangefinder(StreamDevice[float]):
-    """The device."""
+    """Driver of rangefinder."""
 
     kind = DeviceKind.PROXIMITY
 
@@ -41,21 +41,21 @@ class Rangefinder(StreamDevice[float]):
         self._counter: int | None = None
 
     def capabilities(self) -> ProximityCapabilities:
-        """The maker's figures."""
+        """Return the figures of the manufacturer's data sheet."""
         return ProximityCapabilities(min_range_m=0.0, max_range_m=4.0, sigma_m=0.001, rate_hz=RATE_HZ)
 
     def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
-        """The newest sample."""
+        """Return the newest sample."""
         return self.newest(deadline)
 
     def start(self, link: Link) -> None:
-        """Stop, identify, configure, start, as if the device had been left in any state; this one needs none of it."""
+        """Bring the device from any state to streaming: stop, identify, configure, start. This one needs none of it."""
         drain(link)
         self._framer.reset()
         self._counter = None
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Publish each whole frame; the counter tells lost and repeated ones."""
+        """Publish each complete frame; its counter shows which frames were lost or repeated."""
         for frame in self._framer.feed(chunk):
             _, counter, *numbers, _ = FRAME.unpack(frame)
             gap = 1 if self._counter is None else (counter - self._counter) % 256

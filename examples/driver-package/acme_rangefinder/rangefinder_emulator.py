@@ -1,4 +1,4 @@
-"""The far side of rangefinder, worked by any proximity device."""
+"""Emulator of rangefinder, backed by any device of kind proximity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.strict import validate
 
 
 class RangefinderEmulator(WireEmulator):
-    """The device, running."""
+    """Running emulator at the other end of the driver's link."""
 
     period_s = 1.0 / RATE_HZ
 
@@ -25,7 +25,7 @@ class RangefinderEmulator(WireEmulator):
         self._counter = 0
 
     def on_tick(self) -> None:
-        """One frame."""
+        """Send one frame with the newest sample of the backing device."""
         sample = self._backing.read_distance_m(deadline=self.deadline())
         values = [sample.value]
         numbers = [round(1000.0 * value) for value in values]
@@ -37,7 +37,10 @@ class RangefinderEmulator(WireEmulator):
 def start(backing: Device, options: dict[str, Any]) -> RangefinderEmulator:
     """Entry point `rangefinder` in the group `panelwright.emulators`."""
     if not isinstance(backing, Proximity):
-        raise Unsupported(f"rangefinder cannot stand for a {backing.kind}", hint="back it with a proximity device")
+        raise Unsupported(
+            f"the emulator of rangefinder cannot be backed by a device of kind {backing.kind}",
+            hint="choose a driver of kind proximity as the emulator's backing device",
+        )
     emulator = RangefinderEmulator(backing, validate(options, FaultOptions, source="emulators.rangefinder"))
     emulator.begin()
     return emulator

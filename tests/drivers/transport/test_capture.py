@@ -102,7 +102,7 @@ def test_the_end_of_a_recording_is_the_loss_of_the_device(tmp_path: Path) -> Non
             samples_of(device, 5)
     with closing(connect(Context(name="dut"), "serial:tfmini", {"port": "x", "replay": str(path)})) as device:
         until(lambda: isinstance(device.mailbox.error(), DeviceUnavailable))
-        with pytest.raises(DeviceUnavailable, match=r"dut.*at its end"):
+        with pytest.raises(DeviceUnavailable, match=r"dut.*has ended"):
             device.newest(soon(0.5), not_before_s=soon(0.0).at_s)
 
 
@@ -199,7 +199,7 @@ def test_each_opening_of_the_port_is_a_session(lost_twice: Path) -> None:
     opened = replay_opener(lost_twice, "dut")
     assert [opened().read(now_s() + 1.0), opened().read(now_s() + 1.0)] == [b"first", b"second"]
     assert ReplayLink(second).name == "replay of wire"
-    with pytest.raises(DeviceUnavailable, match=r"dut: the recording capture\.jsonl is at its end"):
+    with pytest.raises(DeviceUnavailable, match=r"dut: the recording capture\.jsonl has ended"):
         opened()
 
 

@@ -120,5 +120,5 @@ def test_descriptors_beyond_those_that_select_knows_are_read_too() -> None:
             assert link.read(later(0.01)) == b""
             theirs.sendall(b"news")
             assert link.read(later(5.0)) == b"news"
-            with pytest.raises(NoAnswer, match="takes no more bytes"):
+            with pytest.raises(NoAnswer, match="accepts no more bytes"):
                 link.write(bytes(1 << 24), later(0.01))

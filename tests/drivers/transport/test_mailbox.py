@@ -44,7 +44,7 @@ def test_the_mailbox_gives_the_newest_and_counts_what_a_slow_reader_lost() -> No
 
 def test_an_error_reaches_all_readers_until_the_next_sample() -> None:
     box: Mailbox[int] = Mailbox()
-    box.fail(DeviceFault("broken", hint="mend it"))
+    box.fail(DeviceFault("broken", hint="repair it"))
     for _ in range(2):
         with pytest.raises(DeviceFault, match="broken"):
             box.wait(oldest_host_s=0.0, until_s=later())
@@ -146,7 +146,7 @@ def test_a_failure_wakes_all_readers() -> None:
     threads = [threading.Thread(target=read, daemon=True) for _ in range(3)]
     for thread in threads:
         thread.start()
-    box.fail(DeviceFault("broken", hint="mend it"))
+    box.fail(DeviceFault("broken", hint="repair it"))
     for thread in threads:
         thread.join(30.0)
     assert [error.what for error in errors] == ["broken"] * 3

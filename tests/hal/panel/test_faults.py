@@ -81,8 +81,8 @@ def test_the_places_of_a_slider_are_no_angles() -> None:
         ('kind = "guage"\nradius_m = 0.03\n' + DEGREES, "did you mean 'gauge'?"),
         ('kind = "gauge"\nradus_m = 0.03\n' + DEGREES, "did you mean 'radius_m'?"),
         ('kind = "lamp"\nradius_m = 0.01\nposition_m = [0.195, 0.0]', "5 mm beyond the plate"),
-        ('kind = "lamp"\nradius_m = 0.01\nposition_m = [0.17, 0.13]', "stands"),
-        ('kind = "button"\nradius_m = 0.01\nlights_lamp = "one"', "which is no lamp"),
+        ('kind = "lamp"\nradius_m = 0.01\nposition_m = [0.17, 0.13]', "overlaps"),
+        ('kind = "button"\nradius_m = 0.01\nlights_lamp = "one"', "which is not a lamp"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_a_remedy(keys: str, says: str) -> None:
@@ -103,7 +103,7 @@ def test_all_faults_are_told_at_once() -> None:
         "at_min_deg",
         "at_max_deg",
         "given twice",
-        "15 mm in run",
+        "run overlaps run by 15 mm",
         "lies off the plate",
         "did you mean 'lamp'?",
     ):
@@ -116,8 +116,8 @@ def test_parts_whose_angles_or_keys_are_wrong_still_have_their_place() -> None:
         'kind = "lamp"\nname = "run"\nposition_m = [0.02, 0.0]\nradius_m = 0.01\ncolor = "red"',
         'kind = "lamp"\nname = "off"\nposition_m = [0.02, 0.01]\nradius_m = "10 mm"',
     )
-    assert sum("mm in pressure" in one for one in found) == 1, found
-    assert not any("off" in one and "mm in" in one for one in found), "its size is not known"
+    assert sum("overlaps pressure" in one for one in found) == 1, found
+    assert not any("off" in one and "overlaps" in one for one in found), "its size is not known"
 
 
 def test_the_shipped_panels_can_be_meant() -> None:

@@ -100,4 +100,4 @@ def test_a_real_device_that_cannot_be_broken_is_skipped_with_the_reason(write_ce
     finally:
         far_side.close()
     skipped = {p["promise"]: p["why"] for p in found["devices"]["left"]["promises"] if p["outcome"] == "skipped"}
-    assert skipped["silence is a timeout and in time"] == "this rig has no way to make a device silent"
+    assert skipped["silence is a timeout and in time"] == "this rig cannot make a device silent"

@@ -33,9 +33,9 @@ def cell_of(*devices: Device, names: tuple[str, ...] = ("first", "second")) -> C
 @pytest.mark.parametrize(
     ("one", "other", "says"),
     [
-        (("serial:tfmini", USB), ("serial:bota", USB), "both want serial /dev/ttyUSB0"),
+        (("serial:tfmini", USB), ("serial:bota", USB), "both use serial /dev/ttyUSB0"),
         (("serial:tfmini", USB), ("serial:tfmini", {"port": "/dev/../dev/ttyUSB0"}), "/dev/ttyUSB0"),
-        (("serial:rplidar", USB), ("modbus:touch", USB), "both want serial /dev/ttyUSB0"),
+        (("serial:rplidar", USB), ("modbus:touch", USB), "both use serial /dev/ttyUSB0"),
         (("scip:scanner", {"host": "10.0.0.9"}), ("scip:scanner", {"host": "10.0.0.9"}), "tcp 10.0.0.9:10940"),
         (("udp:netft", {"host": "10.0.0.9"}), ("udp:netft", {"host": "10.0.0.9"}), "udp 10.0.0.9:49152"),
         (("v4l2:camera", {}), ("v4l2:camera", {}), "camera /dev/video0"),
@@ -89,7 +89,7 @@ def test_a_bus_that_is_meant_to_be_shared_is(one: Device, other: Device) -> None
 def test_another_name_of_the_same_port_does_not_hide_it(tmp_path: Path) -> None:
     (tmp_path / "by-id").symlink_to(tmp_path / "ttyUSB0")
     names = [{"port": str(tmp_path / name)} for name in ("ttyUSB0", "by-id")]
-    with pytest.raises(ConfigError, match="both want serial"):
+    with pytest.raises(ConfigError, match="both use serial"):
         check_wires(cell_of(("serial:tfmini", names[0]), ("serial:tfmini", names[1])))
 
 
@@ -109,7 +109,7 @@ def test_a_swap_is_checked_against_the_others_only() -> None:
     cell = cell_of(("serial:tfmini", USB), ("serial:bota", {"port": "/dev/ttyUSB1"}))
     same = cell.file.devices["first"]
     check_wires(cell, {"first": same})
-    with pytest.raises(ConfigError, match="second both want serial /dev/ttyUSB0"):
+    with pytest.raises(ConfigError, match="second both use serial /dev/ttyUSB0"):
         check_wires(cell, {"second": same})
 
 

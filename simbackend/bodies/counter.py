@@ -20,7 +20,7 @@ class CounterBody(Body[Counter]):
     """It shows one number for as long as the world lasts; in half of all worlds its last drum stands between two digits."""
 
     def start(self, panel_object: Counter, u: float) -> Start:
-        """A number of its range that its digits can show."""
+        """Return a number of its range that its digits can show."""
         step = panel_object.step
         low, high = panel_object.minimum, min(panel_object.maximum, (10**panel_object.digits - 1) * step)
         steps = (low + (0.02 + 0.96 * u) * (high - low)) / step
@@ -29,22 +29,22 @@ class CounterBody(Body[Counter]):
         return Start(text=panel_object.text_of(count), value=(count + turned) * step)
 
     def model(self, panel_object: Counter, start: Start) -> ObjectModel:
-        """The face."""
+        """Return the printed face."""
         face = counter_face(panel_object, (start.value or 0.0) / panel_object.step)
         size_m = (panel_object.width_m, panel_object.height_m)
         return ObjectModel(quads=(Quad(pixels=face, size_m=size_m, centre_m=(0, 0, FACE_HEIGHT_M)),))
 
     def print_on(self, canvas: Canvas, panel_object: Counter) -> None:
-        """The label."""
+        """Print the label."""
         canvas.label(panel_object.position_m, panel_object.height_m / 2, panel_object.label)
 
     def truth(self, panel_object: Counter, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
-        """The lower digits, and where the last drum stands."""
+        """Return the lower digits, and where the last drum stands."""
         return ObjectTruth(name=panel_object.name, value=start.value, text=start.text)
 
 
 def counter_face(panel_object: Counter, steps: float) -> Pixels:
-    """Drums that have counted `steps`, in a dark frame; drums after the point are red where digits are white."""
+    """Draw drums that have counted `steps`, in a dark frame; drums after the point are red where digits are white."""
     h, pitch = panel_object.height_m, panel_object.pitch_m
     canvas = Canvas(panel_object.width_m, h, FACE_PX_PER_M, RIM)
     places = drum_places(steps, panel_object.digits)
@@ -61,7 +61,7 @@ def counter_face(panel_object: Counter, steps: float) -> Pixels:
 
 
 def drum_places(steps: float, digits: int) -> list[float]:
-    """Where each drum stands, first one first, in digits: the last gradually, another with the one that passes 9."""
+    """Return where each drum stands, first one first, in digits: the last gradually, another with the one that passes 9."""
     count, turned = int(steps), steps - int(steps)
     places = []
     for _ in range(digits):

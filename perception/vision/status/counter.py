@@ -1,4 +1,4 @@
-"""Mechanical counters: each drum's digit by correlation with drawn digits, all drums weighed together.
+"""Reader of mechanical counters: correlates each drum with drawn digits and decides about all drums together.
 
 A drum may stand between two digits. It does so only if it is the last one, or if the one on its right goes from 9 to 0;
 then both stand equally far. The likeliest number, and how far its last drum has turned, are found by a dynamic program over
@@ -50,7 +50,7 @@ Line = list[tuple[float, float]]
 
 
 def _arc(x: float, y: float, rx: float, ry: float, first_deg: float, last_deg: float) -> Line:
-    """Points of an ellipse's arc, counter-clockwise from the right."""
+    """Return points of an ellipse's arc, counter-clockwise from the right."""
     a = np.deg2rad(np.linspace(first_deg, last_deg, 25))
     return list(zip(x + rx * np.cos(a), y + ry * np.sin(a), strict=True))
 
@@ -101,7 +101,7 @@ class Drums:
 
 
 def read_counter(patch: Patch, spec: Counter) -> PatchReading:
-    """Text and value of a counter. `patch` shows the plane of its face, origin at its middle."""
+    """Read text and value of a counter. `patch` shows the plane of its face, origin at its middle."""
     x, y = _grid(spec, 0)
     middles = _middles(spec)
     seen = [patch.seen(x + middle, y) for middle in middles]
@@ -139,7 +139,7 @@ def read_counter(patch: Patch, spec: Counter) -> PatchReading:
 
 
 def find_drums(scores: Float32) -> Drums:
-    """The likeliest digits.
+    """Find the most likely digits.
 
     Args:
         scores: (drums, rows, turned, 10) correlation of each drum with each digit, for every way in which the row may be
@@ -171,7 +171,7 @@ def find_drums(scores: Float32) -> Drums:
 
 
 def _rival(cell: Float32, digit: int, turned: float, *, may_turn: bool) -> float:
-    """Correlation of a drum with the likeliest place that is more than half a digit away."""
+    """Return the correlation of a drum with the most likely place that is more than half a digit away."""
     shares = TURNED if may_turn else TURNED[:1]
     places = shares[:, None] + np.arange(10)
     away = np.abs((places - digit - turned + 5.0) % 10.0 - 5.0)
@@ -183,7 +183,7 @@ def _middles(spec: Counter) -> Array:
 
 
 def _grid(spec: Counter, reach: int) -> tuple[Array, Array]:
-    """Places of a cell's pixels about the middle of its window, with room to move it; two samples per pixel and side."""
+    """Return the places of a cell's pixels about the middle of its window, with room to move it; two samples per pixel and side."""
     px_m = CELL_HEIGHT * spec.height_m / ROWS
     columns = max(6, round(CELL_WIDTH * spec.pitch_m / px_m))
     half = 2 * (columns + 2 * SIDE_PX * reach), 2 * (ROWS + 2 * UP_PX * reach)
@@ -193,7 +193,7 @@ def _grid(spec: Counter, reach: int) -> tuple[Array, Array]:
 
 
 def _cell(patch: Patch, spec: Counter, middle_m: float) -> Float32:
-    """A drum's window in pixels of a cell; bright digits on a dark ground."""
+    """Return a drum's window in pixels of a cell, with bright digits on a dark ground."""
     x, y = _grid(spec, 1)
     fine = patch.sample(x + middle_m, y)
     cell = fine.reshape(fine.shape[0] // 2, 2, fine.shape[1] // 2, 2).mean(axis=(1, 3))
@@ -201,7 +201,7 @@ def _cell(patch: Patch, spec: Counter, middle_m: float) -> Float32:
 
 
 def _scores(cell: Float32, samples: int) -> Float32:
-    """(heights, variants, turned, 10) correlation of a cell with every drawing, at the best place sideways."""
+    """Return the (heights, 1, turned, 10) correlation of a cell with every drawing, at the best place sideways."""
     columns = samples // 2
     windows = np.lib.stride_tricks.sliding_window_view(cell, (ROWS, columns))
     drawings = _drawings(columns)
@@ -213,7 +213,7 @@ def _scores(cell: Float32, samples: int) -> Float32:
 
 
 def _rows_of(scores: Float32) -> Float32:
-    """(drums, rows, turned, 10) of the scores of all drums: in a row all are drawn alike and lie on one straight line."""
+    """Return (drums, rows, turned, 10) of the scores of all drums: in a row all digits lie on one straight line."""
     drums, heights = scores.shape[:2]
     along = np.linspace(-1.0, 1.0, drums)
     rows = []
@@ -227,7 +227,7 @@ def _rows_of(scores: Float32) -> Float32:
 
 @lru_cache(maxsize=8)
 def _drawings(columns: int) -> Float32:
-    """(variants, turned, 10, pixels) drums as they look in a cell of so many columns, without mean and of unit length."""
+    """Return (variants, turned, 10, pixels) drums as they look in a cell of so many columns, without mean and of unit length."""
     tall_px = [height * ROWS / CELL_HEIGHT for height in HEIGHTS]
     variants = []
     for font, stroke, tall, narrowed in product(FONTS, STROKES, tall_px, NARROWED):
@@ -239,7 +239,7 @@ def _drawings(columns: int) -> Float32:
 
 
 def _drawn(digit: int, font: str | int, height_px: float, stroke: float, narrowed: float, columns: int) -> Float32:
-    """A digit in the middle of a cell with a cell's room above and below, drawn larger and reduced."""
+    """Draw a digit in the middle of a cell with a cell's room above and below, drawn larger and reduced."""
     zoom = DRAWN_LARGER
     canvas = np.zeros((3 * ROWS * zoom, 2 * columns * zoom), np.uint8)
     thick = max(1, round(stroke * height_px * zoom))
@@ -258,7 +258,7 @@ def _drawn(digit: int, font: str | int, height_px: float, stroke: float, narrowe
 
 
 def _turned(digits: list[Float32], digit: int, share: float) -> Float32:
-    """A drum on the way from a digit to the next, which comes up from below."""
+    """Draw a drum on the way from a digit to the next, which comes up from below."""
     pitch = DRUM_PITCH * ROWS / CELL_HEIGHT
     up = share * pitch
     return np.asarray(_window(digits[digit], up) + _window(digits[(digit + 1) % 10], up - pitch), np.float32)
@@ -270,7 +270,7 @@ def _window(strip: Float32, up_px: float) -> Float32:
 
 
 def _unit(rows: Float32) -> Float32:
-    """Rows without their mean, of unit length."""
+    """Return rows without their mean, of unit length."""
     free = rows - rows.mean(axis=-1, keepdims=True)
     return np.asarray(free / np.maximum(np.linalg.norm(free, axis=-1, keepdims=True), 1e-6), np.float32)
 

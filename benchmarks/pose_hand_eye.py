@@ -7,7 +7,8 @@ import numpy as np
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.geometry import UncertainPose, difference, perturbed, transform_rpy
-from perception.calibration.hand_eye import HandEyeView, calibrate_hand_eye, stations
+from perception.calibration.hand_eye import calibrate_hand_eye, stations
+from perception.calibration.hand_eye_equation import HandEyeView
 from perception.vision.quadrangle import estimate
 
 LIGHTS = np.array([[-0.28, 0.2, 0.0], [0.28, 0.2, 0.0], [0.28, -0.2, 0.0], [-0.28, -0.2, 0.0]])

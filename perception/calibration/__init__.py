@@ -11,15 +11,8 @@ from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
     from perception.calibration.boards import BoardView, Charuco, Dots
-    from perception.calibration.in_hand import (
-        UNKNOWN_LENS,
-        Beforehand,
-        InHandCalibration,
-        InHandState,
-        InHandView,
-        calibrate_in_hand,
-        propose_view,
-    )
+    from perception.calibration.in_hand import InHandCalibration, calibrate_in_hand, propose_view
+    from perception.calibration.in_hand_model import UNKNOWN_LENS, Beforehand, InHandState, InHandView
     from perception.calibration.intrinsics import calibrate_camera
     from perception.calibration.records import record_of, renewed, to_toml
     from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner

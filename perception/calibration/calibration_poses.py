@@ -11,7 +11,8 @@ from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.geometry import certain, matrix_of, transform
-from perception.calibration.hand_eye import HandEyeView, propose_next, stations
+from perception.calibration.hand_eye import propose_next, stations
+from perception.calibration.hand_eye_equation import HandEyeView
 
 EDGE_PX = 24.0  # a light nearer to the image's edge may be cut off
 LIGHTS_CONE_RAD = 0.95  # half angle; with 0.6 rad the camera's position along its axis would be 1.5 times as uncertain

@@ -16,22 +16,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest, NotObservable
-from hal.geometry import UncertainPose, matrix_of, perturbed, skew, transform
+from hal.geometry import UncertainPose, matrix_of, perturbed, transform
 from hal.least_squares import Minimum, descend
+from perception.calibration.hand_eye_equation import HandEyeView, Stations, chi_squares, jacobians, noise, residuals
 
 LEAST_AXIS_SPREAD = 0.02  # mean sin^2 between rotation axes: 8 degrees; with less, one coordinate of X is mostly noise
 LEAST_TURN_RAD = 0.05  # smaller rotations between two stations are not used to judge the spread
 LIMIT_M = 0.002  # largest accepted standard deviation of the mount's position, in its worst direction
 LIMIT_RAD = 0.01  # the same for its orientation
 OUTLIER_CHI_SQUARE = 22.5  # a chi-square variable with 6 degrees of freedom exceeds it with a probability of 0.1 %
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class HandEyeView:
-    """One station: the flange pose as the arm reports it, and the target's pose as the camera measures it."""
-
-    base_from_flange: RigidTransform
-    camera_from_target: UncertainPose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,9 +75,9 @@ def calibrate_hand_eye(
     used = list(range(len(views)))
     while True:
         kept = [views[k] for k in used]
-        stack = _Stack.of(kept)
+        stack = Stations.of(kept)
         (x, z), minimum = _fit(stack, _closed_form(stack), arm)
-        errors = _chi_squares(stack, x, z, arm)
+        errors = chi_squares(stack, x, z, arm)
         worst = int(np.argmax(errors))
         if errors[worst] < OUTLIER_CHI_SQUARE or len(used) <= 4:
             break
@@ -95,7 +88,7 @@ def calibrate_hand_eye(
         flange_from_camera=UncertainPose(parent_from_child=x, covariance=minimum.covariance[:6, :6]),
         base_from_target=UncertainPose(parent_from_child=z, covariance=minimum.covariance[6:, 6:]),
         covariance=minimum.covariance, chi_square=minimum.chi_square, degrees=6 * len(used) - 12,
-        residuals=_residuals(_Stack.of(views), x, z), used=tuple(used),
+        residuals=residuals(Stations.of(views), x, z), used=tuple(used),
     )  # fmt: skip
 
 
@@ -143,7 +136,7 @@ def _relative_turns(R: Array) -> tuple[Array, Array]:
     return np.asarray(Rotation.from_matrix(relative).as_rotvec()), pairs
 
 
-def _closed_form(stack: _Stack) -> tuple[RigidTransform, RigidTransform]:
+def _closed_form(stack: Stations) -> tuple[RigidTransform, RigidTransform]:
     """Return X and Z in closed form (Park and Martin).
 
     Aligns the rotation vectors of A_ij and B_ij, the motions between two stations, then solves linearly for the
@@ -165,76 +158,20 @@ def _closed_form(stack: _Stack) -> tuple[RigidTransform, RigidTransform]:
     return x, RigidTransform.from_components(shift.mean(axis=0), mean)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Stack:
-    """The stations as arrays: rotations (N, 3, 3), translations (N, 3) and covariances (N, 6, 6)."""
-
-    Ra: Array
-    ta: Array
-    Rb: Array
-    tb: Array
-    cov_b: Array
-
-    @classmethod
-    def of(cls, views: Sequence[HandEyeView]) -> _Stack:
-        """Collect the arrays of the views."""
-        a = [view.base_from_flange for view in views]
-        b = [view.camera_from_target.parent_from_child for view in views]
-        return cls(
-            Ra=np.array([matrix_of(pose) for pose in a]), ta=np.array([pose.translation for pose in a]),
-            Rb=np.array([matrix_of(pose) for pose in b]), tb=np.array([pose.translation for pose in b]),
-            cov_b=np.array([view.camera_from_target.covariance for view in views]),
-        )  # fmt: skip
-
-
-def _residuals(stack: _Stack, x: RigidTransform, z: RigidTransform) -> Array:
-    """Return the residuals (N, 6): translation and rotation from Z to A X B, base axes."""
-    Rx, Rz = matrix_of(x), matrix_of(z)
-    shift = np.einsum("nij,nj->ni", stack.Ra, stack.tb @ Rx.T + x.translation) + stack.ta - z.translation
-    turn = Rotation.from_matrix(stack.Ra @ Rx @ stack.Rb @ Rz.T).as_rotvec()
-    return np.hstack([shift, turn])
-
-
-def _jacobians(stack: _Stack, x: RigidTransform) -> tuple[Array, Array, Array]:
-    """Return the derivatives (N, 6, 6) of A X B with respect to perturbations of A, of X and of B."""
-    Rx = matrix_of(x)
-    lever_b = stack.tb @ Rx.T
-    lever_x = np.einsum("nij,nj->ni", stack.Ra, x.translation + lever_b)
-    by_a, by_x, by_b = (np.zeros((len(lever_b), 6, 6)) for _ in range(3))
-    by_a[:, range(6), range(6)] = 1.0
-    by_a[:, :3, 3:] = [-skew(lever) for lever in lever_x]
-    by_x[:, :3, :3] = by_x[:, 3:, 3:] = stack.Ra
-    by_x[:, :3, 3:] = stack.Ra @ np.array([-skew(lever) for lever in lever_b])
-    by_b[:, :3, :3] = by_b[:, 3:, 3:] = stack.Ra @ Rx
-    return by_a, by_x, by_b
-
-
-def _noise(stack: _Stack, x: RigidTransform, arm: Array) -> Array:
-    """Return the covariances (N, 6, 6) of the residuals that noise of arm and camera causes."""
-    by_a, _, by_b = _jacobians(stack, x)
-    return np.asarray(by_a @ arm @ by_a.swapaxes(1, 2) + by_b @ stack.cov_b @ by_b.swapaxes(1, 2))
-
-
-def _chi_squares(stack: _Stack, x: RigidTransform, z: RigidTransform, arm: Array) -> Array:
-    """Return the chi-square (N,) of each station."""
-    e = _residuals(stack, x, z)
-    return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(_noise(stack, x, arm), e[:, :, None])[:, :, 0]))
-
-
 def _fit(
-    stack: _Stack, start: tuple[RigidTransform, RigidTransform], arm: Array
+    stack: Stations, start: tuple[RigidTransform, RigidTransform], arm: Array
 ) -> tuple[tuple[RigidTransform, RigidTransform], Minimum]:
     """Fit X and Z by weighted nonlinear least squares, starting at `start`."""
     # The weights depend on X only through levers, so it is enough to compute them at the start and once more.
     state = start
     by_z = -np.tile(np.eye(6), (len(stack.ta), 1, 1))
     for _ in range(2):
-        W = np.linalg.inv(np.linalg.cholesky(_noise(stack, state[0], arm)))
+        W = np.linalg.inv(np.linalg.cholesky(noise(stack, state[0], arm)))
 
         def linearise(poses: tuple[RigidTransform, RigidTransform], W: Array = W) -> tuple[Array, Array]:
             x, z = poses
-            e = np.einsum("nij,nj->ni", W, _residuals(stack, x, z))
-            J = W @ np.concatenate([_jacobians(stack, x)[1], by_z], axis=2)
+            e = np.einsum("nij,nj->ni", W, residuals(stack, x, z))
+            J = W @ np.concatenate([jacobians(stack, x)[1], by_z], axis=2)
             return e.ravel(), J.reshape(-1, 12)
 
         state, minimum = descend(
@@ -291,9 +228,9 @@ def propose_next(
     def information(flange: RigidTransform) -> Array:
         pose = (flange * x).inv() * z
         seen = UncertainPose(parent_from_child=pose, covariance=view_covariance(pose))
-        stack = _Stack.of([HandEyeView(base_from_flange=flange, camera_from_target=seen)])
-        J = np.hstack([_jacobians(stack, x)[1][0], -np.eye(6)])
-        return np.asarray(J.T @ np.linalg.solve(_noise(stack, x, arm)[0], J))
+        stack = Stations.of([HandEyeView(base_from_flange=flange, camera_from_target=seen)])
+        J = np.hstack([jacobians(stack, x)[1][0], -np.eye(6)])
+        return np.asarray(J.T @ np.linalg.solve(noise(stack, x, arm)[0], J))
 
     # A weak prior (0.1 m, 0.3 rad) makes the covariance finite when there are only a few stations.
     known = np.diag([1e2] * 3 + [1e1] * 3 + [1e2] * 3 + [1e1] * 3)

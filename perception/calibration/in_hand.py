@@ -10,7 +10,7 @@ rotation, in the parent's axes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -18,15 +18,25 @@ from scipy.special import chdtrc
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
-from hal.camera_model import disc_offset_px, project_with_jacobian
 from hal.errors import InvalidRequest
-from hal.geometry import UncertainPose, certain, matrix_of, perturbed, skew
+from hal.geometry import UncertainPose, certain
 from hal.least_squares import Minimum, descend
-from perception.calibration.hand_eye import HandEyeView, check_accuracy, check_turns
-from perception.calibration.intrinsics import NAMES, lens_jacobian, parameters, with_parameters
+from perception.calibration.hand_eye import check_accuracy, check_turns
+from perception.calibration.hand_eye_equation import HandEyeView
+from perception.calibration.in_hand_model import (
+    FREE,
+    INDEX,
+    Beforehand,
+    InHandState,
+    InHandView,
+    chi_square,
+    moved,
+    noise,
+    priors_of,
+    residual,
+)
+from perception.calibration.intrinsics import parameters
 
-FREE = ("fx", "fy", "cx", "cy", "k1")  # lens parameters that are estimated
-INDEX = [NAMES.index(name) for name in FREE]
 LIMIT_M = 0.001  # largest accepted standard deviation of the mount; one known less well is no better than its drawing
 LIMIT_RAD = 0.0035
 OUTLIER_P = 1e-4  # a view is an outlier if noise gives its residuals with a smaller probability
@@ -34,62 +44,6 @@ FEWEST_VIEWS = 4
 # Prior standard deviations of mount and target in m and rad, so that the first views can be compared.
 ROUGHLY = np.repeat([0.1, 0.3, 0.1, 0.3], 3)
 LEVER_M = 0.1  # distance at which a rotation error of the mount is converted to a shift
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class InHandView:
-    """One station: flange pose as the arm reports it, points in the image (N, 2), and their covariances (N, 2, 2)."""
-
-    base_from_flange: RigidTransform
-    pixels_px: Array
-    covariance_px: Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class InHandState:
-    """The quantities that are estimated.
-
-    Attributes:
-        flange_from_camera, base_from_target, intrinsics: X, Z and the lens.
-        point_errors_m: (N, 3) errors of the target's points, target frame.
-        offset: (2,) model of the distance between the middle of a lamp and that of its bright spot, common to all
-        views.
-            The first is a factor of the offset of a flat disc seen obliquely (`disc_offset_px`), which is towards its
-            near side; the second is in px outwards in the image, per squared tangent of the angle from the optical
-            axis. They differ from 1 and 0 because a lamp has a body and a glow, and a lens shades.
-    """
-
-    flange_from_camera: RigidTransform
-    base_from_target: RigidTransform
-    intrinsics: CameraIntrinsics
-    point_errors_m: Array
-    offset: Array = field(default_factory=lambda: np.array([1.0, 0.0]))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Beforehand:
-    """Standard deviations of the prior knowledge, and of the arm.
-
-    Attributes:
-        focal_ratio, centre_px, k1: of the lens.
-        point_m: of each coordinate of the target's points.
-        disc_m: radius of the flat disc whose middle a point is; 0 for a corner or a cross. It is no standard deviation.
-        offset: of both parameters of `InHandState.offset`.
-        arm_m, arm_rad: repeatability of the arm, independent at every station.
-    """
-
-    focal_ratio: float
-    centre_px: float
-    k1: float
-    point_m: float = 1e-4
-    arm_m: float = 1e-4
-    arm_rad: float = 1e-4
-    disc_m: float = 0.0
-    offset: tuple[float, float] = (2.0, 0.1)
-
-
-# Accuracy of a lens that is known from its data sheet.
-UNKNOWN_LENS = Beforehand(focal_ratio=0.02, centre_px=15.0, k1=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -145,12 +99,12 @@ def calibrate_in_hand(
         check_turns([HandEyeView(base_from_flange=v.base_from_flange, camera_from_target=certain(v.base_from_flange))
                      for v in kept])  # fmt: skip
         state, minimum = _fit(kept, points_m, start, known)
-        errors = [_chi_square(view, points_m, state, known) for view in kept]
+        errors = [chi_square(view, points_m, state, known) for view in kept]
         worst = int(np.argmax(errors))
         if chdtrc(2 * len(points_m), errors[worst]) > OUTLIER_P or len(used) <= FEWEST_VIEWS:
             break
         del used[worst]
-    rest = np.concatenate([_residual(views[k], points_m, state, known.disc_m)[0] for k in used])
+    rest = np.concatenate([residual(views[k], points_m, state, known.disc_m)[0] for k in used])
     # Residuals larger than the stated noise explains make all parameters less certain, in proportion.
     covariance = minimum.covariance * max(1.0, minimum.chi_square / (len(rest) - 12))
     check_accuracy(covariance, len(used), limit_m=limit_m, limit_rad=limit_rad)
@@ -191,7 +145,7 @@ def propose_view(
     """
     if not candidates:
         raise InvalidRequest("no candidate poses", hint="give flange poses from which the target is in view")
-    priors = _priors(state.intrinsics, known, len(points_m))
+    priors = priors_of(state.intrinsics, known, len(points_m))
     beforehand = np.diag(np.concatenate([ROUGHLY**-2.0, priors**-2.0]))
     so_far = sum((_information(pose, points_m, state, known, sigma_px) for pose in done), beforehand)
     weight = np.repeat([1.0, LEVER_M**2], 3)
@@ -210,8 +164,8 @@ def _information(
     nothing = np.zeros((len(points_m), 2))
     covariance = np.tile(sigma_px**2 * np.eye(2), (len(points_m), 1, 1))
     view = InHandView(base_from_flange=flange, pixels_px=nothing, covariance_px=covariance)
-    _, J = _residual(view, points_m, state, known.disc_m)
-    return np.asarray(J.T @ np.linalg.solve(_noise(view, points_m, state, known), J))
+    _, J = residual(view, points_m, state, known.disc_m)
+    return np.asarray(J.T @ np.linalg.solve(noise(view, points_m, state, known), J))
 
 
 def _check(views: Sequence[InHandView], points_m: Array) -> None:
@@ -233,11 +187,11 @@ def _fit(
     views: Sequence[InHandView], points_m: Array, start: InHandState, known: Beforehand
 ) -> tuple[InHandState, Minimum]:
     """Fit the state by weighted nonlinear least squares with priors."""
-    priors = _priors(start.intrinsics, known, len(points_m))
+    priors = priors_of(start.intrinsics, known, len(points_m))
     believed = parameters(start.intrinsics)[INDEX]
     state = start
     for _ in range(2):  # the weights depend only on levers; those of the first result are accurate enough
-        whiten = [np.linalg.inv(np.linalg.cholesky(_noise(view, points_m, state, known))) for view in views]
+        whiten = [np.linalg.inv(np.linalg.cholesky(noise(view, points_m, state, known))) for view in views]
 
         def linearise(at: InHandState, whiten: list[Array] = whiten) -> tuple[Array, Array]:
             lens = parameters(at.intrinsics)[INDEX] - believed
@@ -245,88 +199,10 @@ def _fit(
             residuals = [surprise / priors]
             rows = [np.hstack([np.zeros((len(priors), 12)), np.diag(1.0 / priors)])]
             for view, W in zip(views, whiten, strict=True):
-                r, J = _residual(view, points_m, at, known.disc_m)
+                r, J = residual(view, points_m, at, known.disc_m)
                 residuals.append(W @ r)
                 rows.append(W @ J)
             return np.concatenate(residuals), np.vstack(rows)
 
-        state, minimum = descend(state, linearise, _moved)
+        state, minimum = descend(state, linearise, moved)
     return state, minimum
-
-
-def _priors(lens: CameraIntrinsics, known: Beforehand, count: int) -> Array:
-    """Return prior standard deviations of lens, point coordinates and offset, in the order of the state's step."""
-    of_lens = [
-        known.focal_ratio * lens.fx_px,
-        known.focal_ratio * lens.fy_px,
-        known.centre_px,
-        known.centre_px,
-        known.k1,
-    ]
-    return np.array(of_lens + [known.point_m] * (3 * count) + list(known.offset))
-
-
-def _moved(state: InHandState, step: Array) -> InHandState:
-    """Return the state after a step: mount (6), target (6), lens, point errors (3N) and offset (2)."""
-    values = parameters(state.intrinsics)
-    values[INDEX] += step[12 : 12 + len(FREE)]
-    return InHandState(
-        flange_from_camera=perturbed(state.flange_from_camera, step[:6]),
-        base_from_target=perturbed(state.base_from_target, step[6:12]),
-        intrinsics=with_parameters(state.intrinsics, values),
-        point_errors_m=state.point_errors_m + step[12 + len(FREE) : -2].reshape(-1, 3),
-        offset=state.offset + step[-2:],
-    )
-
-
-def _residual(view: InHandView, points_m: Array, state: InHandState, disc_m: float) -> tuple[Array, Array]:
-    """Return the residuals (2N,), predicted minus measured pixels, and their Jacobian (2N, p) over the state's step."""
-    Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
-    Ra = matrix_of(view.base_from_flange)
-    turned = (points_m + state.point_errors_m) @ Rz.T
-    in_flange = (turned + state.base_from_target.translation - view.base_from_flange.translation) @ Ra
-    q = (in_flange - state.flange_from_camera.translation) @ Rx
-    pixels, by_q = project_with_jacobian(q, state.intrinsics)
-    n = len(points_m)
-    camera_from_base = (Ra @ Rx).T
-    tangent = q[:, :2] / q[:, 2:]
-    J = np.zeros((n, 2, 12 + len(FREE) + 3 * n + 2))
-    lever = [skew(p) for p in in_flange - state.flange_from_camera.translation]
-    J[:, :, :3], J[:, :, 3:6] = -by_q @ Rx.T, by_q @ (Rx.T @ np.array(lever))  # - r x f = [f]x r
-    J[:, :, 6:9] = by_q @ camera_from_base
-    J[:, :, 9:12] = by_q @ (camera_from_base @ np.array([-skew(p) for p in turned]))
-    J[:, :, 12 : 12 + len(FREE)] = lens_jacobian(tangent, state.intrinsics)[:, :, INDEX]
-    by_point = by_q @ camera_from_base @ Rz
-    for k in range(n):
-        J[k, :, 12 + len(FREE) + 3 * k :][:, :3] = by_point[k]
-    # The offsets are some hundredths of a pixel, so their derivatives with respect to the poses are neglected.
-    camera_from_target = (view.base_from_flange * state.flange_from_camera).inv() * state.base_from_target
-    J[:, :, -2] = disc_offset_px(points_m, disc_m, camera_from_target, state.intrinsics)
-    J[:, :, -1] = tangent * np.linalg.norm(tangent, axis=1, keepdims=True)
-    return (pixels + J[:, :, -2:] @ state.offset - view.pixels_px).ravel(), J.reshape(2 * n, -1)
-
-
-def _noise(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> Array:
-    """Return the covariance (2N, 2N) of a view's residuals: noise of the pixels, and the common effect of the arm."""
-    Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
-    Ra = matrix_of(view.base_from_flange)
-    world = (points_m + state.point_errors_m) @ Rz.T + state.base_from_target.translation
-    from_flange = world - view.base_from_flange.translation
-    _, by_q = project_with_jacobian(
-        (from_flange @ Ra - state.flange_from_camera.translation) @ Rx, state.intrinsics
-    )  # fmt: skip
-    camera_from_base = (Ra @ Rx).T
-    by_arm = np.concatenate(
-        [-by_q @ camera_from_base, by_q @ (camera_from_base @ np.array([skew(p) for p in from_flange]))], axis=2
-    ).reshape(-1, 6)
-    arm = np.diag([known.arm_m**2] * 3 + [known.arm_rad**2] * 3)
-    noise = by_arm @ arm @ by_arm.T
-    for k, covariance in enumerate(view.covariance_px):
-        noise[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += covariance
-    return np.asarray(noise)
-
-
-def _chi_square(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> float:
-    """Return the chi-square of one view."""
-    r, _ = _residual(view, points_m, state, known.disc_m)
-    return float(r @ np.linalg.solve(_noise(view, points_m, state, known), r))

@@ -8,7 +8,8 @@ from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, Mou
 from hal.geometry import UncertainPose
 from hal.toml_text import toml_edited, toml_text
 from perception.calibration.hand_eye import HandEye
-from perception.calibration.in_hand import FREE, InHandCalibration
+from perception.calibration.in_hand import InHandCalibration
+from perception.calibration.in_hand_model import FREE
 from perception.calibration.intrinsics import CameraCalibration
 from perception.calibration.scanner import ScannerCalibration
 from perception.calibration.wrench import WrenchCalibration

@@ -20,7 +20,8 @@ from perception.calibration.calibration_poses import (
     plate_view,
     wrist_turns,
 )
-from perception.calibration.hand_eye import HandEyeView, check_turns
+from perception.calibration.hand_eye import check_turns
+from perception.calibration.hand_eye_equation import HandEyeView
 from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
 
 ROOT = Path(__file__).parents[3]

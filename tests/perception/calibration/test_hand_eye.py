@@ -8,7 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, difference, perturbed, transform, transform_rpy
-from perception.calibration.hand_eye import HandEyeView, calibrate_hand_eye, propose_next, stations
+from perception.calibration.hand_eye import calibrate_hand_eye, propose_next, stations
+from perception.calibration.hand_eye_equation import HandEyeView
 
 X_TRUE = transform_rpy([0.03, -0.05, 0.08], [0.02, -0.03, np.pi / 2])
 Z_TRUE = transform_rpy([0.7, 0.1, 0.4], [0.0, -np.pi / 2, 0.3])

@@ -13,17 +13,15 @@ from hal.camera_model import project
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import difference, perturbed, transform_rpy
 from perception.calibration.hand_eye import stations
-from perception.calibration.in_hand import (
+from perception.calibration.in_hand import InHandCalibration, calibrate_in_hand, propose_view
+from perception.calibration.in_hand_model import (
     FREE,
     UNKNOWN_LENS,
     Beforehand,
-    InHandCalibration,
     InHandState,
     InHandView,
-    _moved,
-    _residual,
-    calibrate_in_hand,
-    propose_view,
+    moved,
+    residual,
 )
 
 LENS = CameraIntrinsics(width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5,
@@ -73,12 +71,12 @@ def solved(seed: int, **more: float) -> InHandCalibration:
 @pytest.mark.parametrize("disc_m", [0.0, 0.008])
 def test_the_derivatives_are_those_of_finite_differences(disc_m: float) -> None:
     view, state, step = drawn(1, poses(4))[2], start(), 1e-6
-    _, jacobian = _residual(view, POINTS, state, disc_m)
+    _, jacobian = residual(view, POINTS, state, disc_m)
     # The offset of a disc, 0.01 px, is kept constant while camera and target move, so only its own columns are checked.
     for k in range(0 if disc_m == 0.0 else jacobian.shape[1] - 2, jacobian.shape[1]):
         bump = np.zeros(jacobian.shape[1])
         bump[k] = step
-        ahead, behind = (_residual(view, POINTS, _moved(state, b), disc_m)[0] for b in (bump, -bump))
+        ahead, behind = (residual(view, POINTS, moved(state, b), disc_m)[0] for b in (bump, -bump))
         assert np.allclose((ahead - behind) / (2 * step), jacobian[:, k], rtol=1e-4, atol=1e-3), k
 
 
@@ -101,8 +99,8 @@ def test_what_all_lamps_are_off_by_does_not_pass_for_the_mount() -> None:
     for seed in range(10):
         views = drawn(seed, stations(Z_TRUE, X_TRUE, distance_m=0.6, count=12, cone_rad=0.95))
         for k, view in enumerate(views):
-            seen = _residual(view, POINTS, replace(start(), offset=offset), known.disc_m)[0]
-            plain = _residual(view, POINTS, replace(start(), offset=np.zeros(2)), known.disc_m)[0]
+            seen = residual(view, POINTS, replace(start(), offset=offset), known.disc_m)[0]
+            plain = residual(view, POINTS, replace(start(), offset=np.zeros(2)), known.disc_m)[0]
             views[k] = replace(view, pixels_px=view.pixels_px + (seen - plain).reshape(-1, 2))
         result = calibrate_in_hand(views, POINTS, start(), known)
         e = difference(X_TRUE, result.flange_from_camera.parent_from_child)

@@ -14,7 +14,7 @@ import numpy as np
 
 from hal.arrays import Indices, Labels, Mask
 from hal.jit import compiled
-from perception.range.segmentation.union_find import unite
+from hal.union_find import unite
 from perception.range.tiles import for_each_tile, tile_rows
 
 

@@ -10,6 +10,7 @@ import math
 
 from hal.arrays import Array
 from hal.jit import inlined
+from hal.small_algebra import factor
 
 Vec = tuple[float, float, float]
 Sym = tuple[float, float, float, float, float, float]
@@ -91,39 +92,7 @@ def turned(R: Array, a: Vec) -> Vec:
 @inlined
 def cholesky(S: Array, n: int) -> bool:
     """Compute the lower factor of the leading n x n block in place; returns False when it is not positive definite."""
-    for j in range(n):
-        s = S[j, j]
-        for k in range(j):
-            s -= S[j, k] * S[j, k]
-        if not s > 1e-300:
-            return False
-        S[j, j] = math.sqrt(s)
-        for i in range(j + 1, n):
-            s = S[i, j]
-            for k in range(j):
-                s -= S[i, k] * S[j, k]
-            S[i, j] = s / S[j, j]
-    return True
-
-
-@inlined
-def solve_lower(L: Array, b: Array, n: int) -> None:
-    """Replace b by L^-1 b."""
-    for i in range(n):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * b[k]
-        b[i] = s / L[i, i]
-
-
-@inlined
-def solve_upper(L: Array, b: Array, n: int) -> None:
-    """Replace b by L^-T b."""
-    for i in range(n - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * b[k]
-        b[i] = s / L[i, i]
+    return factor(S, S, 0.0, 0.0, 0.0, S, n)
 
 
 @inlined

@@ -1,27 +1,77 @@
 """Minimises a sum of squares by Levenberg-Marquardt steps and refuses problems that the data do not determine.
 
 Residuals are whitened by their covariance, so that the sum is a chi-square and the inverse of J^T J is a covariance.
-Loops that run thousands of times per second do not use this module; they are compiled together with their residuals.
 
-Source: D. W. Marquardt, J. SIAM 11(2), 1963: the damping is scaled by the diagonal of J^T J, divided by ten after a
-step that reduces the sum, and multiplied by ten after one that does not.
+`descend` minimises any residuals. The loops that run thousands of times per second are compiled together with their
+residuals: those of `fusion.solve.descent`, `perception.vision.quadrangle` and `perception.range.fitting`. They differ in
+how they linearise and move, and share the step, `solve_damped`, and the rule that follows it, `next_damping`.
+
+Source: D. W. Marquardt, J. SIAM 11(2), 1963: the damping is scaled by the diagonal of J^T J, falls after a step that
+reduces the sum, and rises after one that does not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from hal.arrays import Array
 from hal.errors import NotObservable
+from hal.jit import inlined
+from hal.small_algebra import factor, solve_lower, solve_upper
 
 S = TypeVar("S")
 
 STEPS = 60
 CONVERGED = 1e-10  # decrease of chi-square in one step, relative to 1 + chi-square
+
+
+class DampingRule(NamedTuple):
+    """How the damping follows from whether a step has reduced the sum of squares.
+
+    Attributes:
+        fall, rise: factors after a step that reduces the sum, and after one that does not.
+        least: it does not fall below this.
+        restart: it rises at least to this.
+        most: the descent ends above this.
+    """
+
+    fall: float
+    rise: float
+    least: float
+    restart: float
+    most: float
+
+
+RULE = DampingRule(fall=0.1, rise=10.0, least=1e-12, restart=0.0, most=1e8)
+
+
+@inlined
+def next_damping(damping: float, is_lower: bool, rule: DampingRule) -> float:
+    """Return the damping of the next step; the descent ends when it exceeds `rule.most`."""
+    if is_lower:
+        return max(damping * rule.fall, rule.least)
+    return max(damping * rule.rise, rule.restart)
+
+
+@inlined
+def solve_damped(A: Array, D: Array, damping: float, floor: float, least: float, b: Array, L: Array, n: int) -> float:
+    """Solve (A + damping diag(D) + floor I) x = b, overwrite `b` (n,) with x and return the predicted decrease b^T x.
+
+    Only the lower triangles of A and D (n, n) are read; `L` (n, n) receives the Cholesky factor. Returns -1 when a
+    pivot is not above `least` times the entry of D, so that there is no step.
+    """
+    if not factor(A, D, damping, floor, least, L, n):
+        return -1.0
+    solve_lower(L, b, n)
+    fall = 0.0
+    for i in range(n):
+        fall += b[i] * b[i]
+    solve_upper(L, b, n)
+    return fall
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,12 +108,12 @@ def descend(
         if new_residual @ new_residual <= residual @ residual:
             fall = float(residual @ residual - new_residual @ new_residual)
             state, residual, jacobian = candidate, new_residual, new_jacobian
-            damping = max(damping / 10.0, 1e-12)
+            damping = next_damping(damping, True, RULE)
             if fall < CONVERGED * (1.0 + float(residual @ residual)):
                 break
         else:
-            damping *= 10.0
-            if damping > 1e8:
+            damping = next_damping(damping, False, RULE)
+            if damping > RULE.most:
                 break
     information = jacobian.T @ jacobian
     return state, Minimum(

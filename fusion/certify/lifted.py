@@ -14,6 +14,7 @@ from fusion.distance.rows import NEAR, rows
 from fusion.vectors import Vec, across, cholesky, cross, turned, vec
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.small_algebra import put2
 
 SIZE = 16  # numbers in z: 1, R row by row at 1, t at 10, s at 13
 
@@ -91,7 +92,7 @@ def _prior_rows(b: Batch, about: Vec, middle: Vec, size: float, Z: Array) -> Non
             side = cross(n, (b.prior_r[0, j], b.prior_r[1, j], b.prior_r[2, j]))
             for i in range(3):
                 plain[3 + k, 1 + 3 * i + j] = 0.5 * side[i]
-    Z[:6] = b.prior_w @ plain
+    put2(Z, b.prior_w @ plain)
 
 
 @compiled

@@ -16,9 +16,10 @@ import math
 import numpy as np
 
 from fusion.batch import Batch
-from fusion.vectors import Vec, across, cholesky, cross, dot, form, rotation_vector, solve_lower, sym, turned, vec
+from fusion.vectors import Sym, Vec, across, cholesky, cross, dot, form, rotation_vector, sym, turned, vec
 from hal.arrays import Array
 from hal.jit import as_numpy_scalar, compiled, inlined
+from hal.small_algebra import solve_lower
 
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 NEAR, FAR = (
@@ -103,6 +104,15 @@ def rows(b: Batch, i: int, R: Array, t: Array, far: bool, r: Array, J: Array, V:
         else:
             V[1, 0], V[1, 1] = v1 * e1 * u1 + v2 * e2 * u2, v1 * u1 * u1 + v2 * u2 * u2 + FLOOR * (v1 + v2)
         return 2
+    return _rows_about_direction(c, e, q, C, d, a1, a2, v1, v2, u, far, r, J, V)
+
+
+@inlined
+def _rows_about_direction(
+    c: int, e: Vec, q: Vec, C: Sym, d: Vec, a1: Vec, a2: Vec, v1: float, v2: float, u: Vec, far: bool,
+    r: Array, J: Array, V: Array,
+) -> int:  # fmt: skip
+    """Fill the rows of classes 2, 3, 5, 6 and 9, in which a direction u = R w of the object multiplies e."""
     if c in (2, 5):
         n1 = across(u)
         n2 = cross(u, n1)

@@ -17,6 +17,7 @@ from fusion.solve.descent import cost_of, descend
 from fusion.solve.placement import place
 from hal.arrays import Array
 from hal.jit import as_numpy_scalar, compiled, inlined
+from hal.small_algebra import put1, put2
 
 SUBSET_DOF = 7  # six unknowns and one for a check; with 8, clean subsets are found a third less often
 SUBSET_MOST = 8  # largest number of measurements in a subset
@@ -78,7 +79,8 @@ def _start(b: Batch, draws: Array, h: int, use: Array, R: Array, t: Array, work:
         cost = cost_of(b, use, R1, t1, FAR, work)
         if cost < least:
             least = cost
-            R[:], t[:] = R1, t1
+            put2(R, R1)
+            put1(t, t1)
 
 
 @compiled
@@ -90,7 +92,8 @@ def hypotheses(b: Batch, draws: Array, Rs: Array, ts: Array, costs: Array) -> No
         R, t = Rs[h], ts[h]
         _pick(b, draws, h, use)
         if b.cls[n - 1] == 0 and use[n - 1] > 0.0:
-            R[:], t[:] = b.prior_r, b.prior_t
+            put2(R, b.prior_r)
+            put1(t, b.prior_t)
         else:
             _start(b, draws, h, use, R, t, work)
         costs[h] = np.inf
@@ -128,7 +131,8 @@ def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: A
             break
         if rank >= most and (costs[h] > costs[order[0]] + OTHER_COST or not _is_other(Rs[h], R, kept)):
             continue
-        R[kept], t[kept] = Rs[h], ts[h]
+        put2(R[kept], Rs[h])
+        put1(t[kept], ts[h])
         cost[kept] = settle(b, R[kept], t[kept], f, ANNEALED)
         number[kept] = 0
         for i in range(n):
@@ -137,7 +141,9 @@ def candidates(b: Batch, draws: Array, most: int, Rs: Array, ts: Array, costs: A
         kept += 1
     order = np.argsort(cost[:kept])
     for k in range(kept):
-        Rs[k], ts[k], costs[k], inside[k] = R[order[k]], t[order[k]], cost[order[k]], number[order[k]]
+        put2(Rs[k], R[order[k]])
+        put1(ts[k], t[order[k]])
+        costs[k], inside[k] = cost[order[k]], number[order[k]]
     return kept
 
 
@@ -199,12 +205,15 @@ def readmit(b: Batch, R: Array, t: Array, cost: float) -> float:
         for i in range(n):
             if left_out[i] < b.gate[i]:
                 continue
-            R1[:], t1[:] = R, t
+            put2(R1, R)
+            put1(t1, t)
             for k in range(n):
                 use[k] = 1.0 if left_out[k] < b.gate[k] or k == i else 0.0
             descend(b, use, R1, t1, NEAR, STEPS, 1e-6)
             now = settle(b, R1, t1, f, AS_IT_IS)
             if now < cost - LEAST_GAIN:
-                R[:], t[:], cost, better = R1, t1, now, True
+                put2(R, R1)
+                put1(t, t1)
+                cost, better = now, True
                 break
     return cost

@@ -6,9 +6,14 @@ import numpy as np
 
 from fusion.batch import Batch
 from fusion.distance.rows import rows, whitened
-from fusion.vectors import cholesky, move, solve_lower, solve_upper
+from fusion.vectors import cholesky, move
 from hal.arrays import Array
 from hal.jit import compiled
+from hal.least_squares import DampingRule, next_damping, solve_damped
+from hal.small_algebra import put1, put2, solve_lower
+
+RULE = DampingRule(fall=0.1, rise=8.0, least=1e-9, restart=1e-6, most=1e8)
+FLOOR = 1e-12  # of the information, relative to its largest entry, because measurements may leave a motion free
 
 
 @compiled
@@ -55,7 +60,7 @@ def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) ->
 
 
 @compiled
-def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:  # noqa: PLR0912 - one flat loop, for the compiler
+def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:
     """Minimise sum |r|^2 over entries with use > 0 by Levenberg-Marquardt, moving R, t in place; returns the cost.
 
     The step is damped in proportion to the diagonal of J^T J (Marquardt), so metres and radians need no common scale.
@@ -70,44 +75,30 @@ def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tol
         size = 0.0
         for j in range(6):
             size = max(size, H[j, j])
-        for p in range(6):
-            for c in range(p):
-                L[p, c] = H[p, c]
-            L[p, p] = H[p, p] * (1.0 + damping) + 1e-12 * size
-            step[p] = -g[p]
-        if not cholesky(L, 6):
-            damping = max(10.0 * damping, 1e-6)
+            step[j] = -g[j]
+        fall = solve_damped(H, H, damping, FLOOR * size, 0.0, step, L, 6)
+        if fall < 0.0:
+            damping = next_damping(damping, False, RULE)
             continue
-        solve_lower(L, step, 6)
-        fall = 0.0
-        for j in range(6):
-            fall += step[j] * step[j]
-        solve_upper(L, step, 6)
         turn = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
         if turn > 1.0:  # the linearisation is not valid beyond a radian
             for j in range(6):
                 step[j] /= turn**0.5
-        for p in range(3):
-            t1[p] = t[p]
-            for c in range(3):
-                R1[p, c] = R[p, c]
+        put1(t1, t)
+        put2(R1, R)
         move(R1, t1, step)
         # Most steps are taken, so the next system is built at once instead of the cost alone.
         lower = accumulate(b, use, R1, t1, far, H1, g1, work)
-        if lower < cost:
+        is_lower = lower < cost
+        if is_lower:
             R, R1, t, t1 = R1, R, t1, t
             H, H1, g, g1 = H1, H, g1, g
             swapped = not swapped
             cost = lower
-            damping = max(0.1 * damping, 1e-9)
-            if fall < tolerance:
-                break
-        else:
-            if fall < tolerance:
-                break
-            damping = max(8.0 * damping, 1e-6)
-            if damping > 1e8:
-                break
-    if swapped:
-        R1[:], t1[:] = R, t
+        damping = next_damping(damping, is_lower, RULE)
+        if fall < tolerance or damping > RULE.most:
+            break
+    if swapped:  # R1 and t1 are the arguments
+        put2(R1, R)
+        put1(t1, t)
     return cost

@@ -6,9 +6,10 @@ import numpy as np
 
 from fusion.batch import Batch
 from fusion.distance.rows import FAR, rows
-from fusion.vectors import cholesky, solve_lower, solve_upper, turned, vec
+from fusion.vectors import turned, vec
 from hal.arrays import Array
 from hal.jit import compiled
+from hal.small_algebra import solve_positive
 
 
 @compiled
@@ -46,8 +47,6 @@ def place(b: Batch, use: Array, R: Array, t: Array) -> None:  # noqa: PLR0912 - 
                 x[p] -= J[k, p] * r[k]
                 for c in range(p + 1):
                     A[p, c] += J[k, p] * J[k, c]
-    if cholesky(A, 3):
-        solve_lower(A, x, 3)
-        solve_upper(A, x, 3)
+    if solve_positive(A, x, 3):
         for k in range(3):
             t[k] += x[k]

@@ -11,10 +11,11 @@ import numpy as np
 from fusion.batch import Batch
 from fusion.distance.exact import evaluate
 from fusion.distance.rows import FAR, NEAR, rows
-from fusion.solve.descent import accumulate, descend
-from fusion.vectors import cholesky, move, solve_lower, solve_upper
+from fusion.solve.descent import FLOOR, accumulate, descend
+from fusion.vectors import move
 from hal.arrays import Array
 from hal.jit import as_numpy_scalar, compiled
+from hal.least_squares import solve_damped
 
 COARSE_STEPS, FINE_STEPS = as_numpy_scalar(30), as_numpy_scalar(20)
 ANYWHERE = as_numpy_scalar(True)
@@ -47,18 +48,12 @@ def polish(  # noqa: PLR0912 - one flat loop, for the compiler
         size = 0.0
         for j in range(6):
             size = max(size, H[j, j])
-        L[:] = H
-        for j in range(6):
-            L[j, j] += 1e-12 * size
-        if not cholesky(L, 6):
+        predicted = solve_damped(H, H, 0.0, FLOOR * size, 0.0, step, L, 6)
+        if predicted < 0.0:
             break
-        solve_lower(L, step, 6)
-        fall = 0.0
-        for j in range(6):
-            fall += step[j] ** 2
+        fall = predicted
         if fall < 1e-20:
             break
-        solve_upper(L, step, 6)
         if step[3] ** 2 + step[4] ** 2 + step[5] ** 2 > 1.0:
             break
         move(R, t, step)

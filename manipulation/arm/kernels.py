@@ -10,6 +10,7 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.small_algebra import put1
 
 
 @compiled
@@ -89,7 +90,7 @@ def pose_error(goal: Array, pose: Array) -> Array:
     out = np.empty(6)
     for k in range(3):
         out[k] = goal[k, 3] - pose[k, 3]
-    out[3:] = rotation_log(np.ascontiguousarray(goal[:3, :3]) @ np.ascontiguousarray(pose[:3, :3].T))
+    put1(out[3:], rotation_log(np.ascontiguousarray(goal[:3, :3]) @ np.ascontiguousarray(pose[:3, :3].T)))
     return out
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.small_algebra import put1, put2
 from manipulation.arm.kernels import follow_pose, frames, rotation_exp
 
 
@@ -26,7 +27,8 @@ def pose_on_path(
     out = np.eye(4)
     last = times_s.shape[0] - 1
     if last == 0 or t_s >= times_s[last]:
-        out[:3, :3], out[:3, 3] = rotations[last], points[last]
+        put2(out, rotations[last])
+        put1(out[:3, 3], points[last])
         return out
     i = min(max(np.searchsorted(times_s, t_s, side="right") - 1, 0), last - 1)
     h = times_s[i + 1] - times_s[i]
@@ -36,8 +38,9 @@ def pose_on_path(
     if length > 0.0:
         rise = u * u * (3.0 - 2.0 * u)
         f = rise + (u * (1.0 - u) ** 2 * speeds[i] + u * u * (u - 1.0) * speeds[i + 1]) * h / length
-    out[:3, :3] = rotation_exp(f * turns[i]) @ rotations[i]
-    out[:3, 3] = points[i] + f * (points[i + 1] - points[i])
+    put2(out, rotation_exp(f * turns[i]) @ rotations[i])
+    for k in range(3):
+        out[k, 3] = points[i, k] + f * (points[i + 1, k] - points[i, k])
     return out
 
 
@@ -63,8 +66,10 @@ def path_joints(
     """
     pose = pose_on_path(times_s, ways, speeds, points, rotations, turns, t_s)
     rotation = rotation_exp(shift[3:]) @ np.ascontiguousarray(pose[:3, :3])
-    pose[:3, 3] += shift[:3] + rotation @ offset[:3]
-    pose[:3, :3] = rotation @ rotation_exp(offset[3:])
+    moved = rotation @ offset[:3]
+    for k in range(3):
+        pose[k, 3] += shift[k] + moved[k]
+    put2(pose, rotation @ rotation_exp(offset[3:]))
     return follow_pose(dh, flange_from_tool, q, pose, damping, 2)
 
 
@@ -117,7 +122,7 @@ def wrench_at(wrench: Array, child_from_parent: Array) -> Array:
     r, p = np.ascontiguousarray(child_from_parent[:3, :3]), child_from_parent[:3, 3]
     force, torque = r @ wrench[:3], r @ wrench[3:]
     out = np.empty(6)
-    out[:3] = force
+    put1(out, force)
     out[3] = torque[0] + p[1] * force[2] - p[2] * force[1]
     out[4] = torque[1] + p[2] * force[0] - p[0] * force[2]
     out[5] = torque[2] + p[0] * force[1] - p[1] * force[0]

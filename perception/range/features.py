@@ -15,8 +15,6 @@ import numpy as np
 from hal.arrays import Array
 from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface
 
-LEAST_CREASE_RAD = 0.15  # planes at a smaller angle intersect in a line that is mostly determined by noise
-
 
 class FeatureKind(StrEnum):
     """Geometric type of a feature."""
@@ -120,73 +118,6 @@ def point_feature(surface: Surface) -> RangeFeature:
     )
 
 
-def crease_line(a: Surface, b: Surface, near_m: Array | None = None) -> RangeFeature | None:
-    """Return the line in which two planes intersect, with covariance; None if they are nearly parallel.
-
-    Its point is the one nearest `near_m` (3,), or nearest the mean of the planes' middles.
-    """
-    pa, pb = plane_feature(a), plane_feature(b)
-    cross = np.cross(pa.direction, pb.direction)
-    sine = float(np.linalg.norm(cross))
-    if sine < np.sin(LEAST_CREASE_RAD):
-        return None
-    direction = cross / sine
-    near = 0.5 * (a.middle_m + b.middle_m) if near_m is None else near_m
-
-    def solve(n1: Array, o1: float, n2: Array, o2: float) -> Array:
-        u = np.cross(n1, n2)
-        u /= np.linalg.norm(u)
-        rows = np.stack([n1, n2, u])
-        return np.asarray(np.linalg.solve(rows, np.array([o1, o2, float(u @ near)])))
-
-    def line(step: Array) -> Array:
-        na, nb = pa.direction + step[:3], pb.direction + step[3:6]
-        point = solve(na, float(na @ pa.point_m) + step[6], nb, float(nb @ pb.point_m) + step[7])
-        u = np.cross(na, nb)
-        return np.concatenate([point, u / np.linalg.norm(u)])
-
-    J = _jacobian(line, 8, 1e-6)
-    S = np.zeros((8, 8))
-    S[:3, :3], S[3:6, 3:6] = pa.direction_covariance, pb.direction_covariance
-    S[6, 6], S[7, 7] = np.trace(pa.point_covariance), np.trace(pb.point_covariance)
-    C = J @ S @ J.T
-    across = np.eye(3) - np.outer(direction, direction)
-    return RangeFeature(
-        kind=FeatureKind.LINE,
-        point_m=line(np.zeros(8))[:3],
-        point_covariance=across @ C[:3, :3] @ across,
-        direction=direction,
-        direction_covariance=across @ C[3:, 3:] @ across,
-        labels=(a.label, b.label),
-    )
-
-
-def corner_point(a: Surface, b: Surface, c: Surface) -> RangeFeature | None:
-    """Return the point in which three planes intersect, with covariance; None if their normals are nearly coplanar."""
-    planes = [plane_feature(s) for s in (a, b, c)]
-    N = np.stack([p.direction for p in planes])
-    if np.linalg.svd(N, compute_uv=False)[-1] < np.sin(LEAST_CREASE_RAD):
-        return None
-    offsets = np.array([p.direction @ p.point_m for p in planes])
-    point = np.linalg.solve(N, offsets)
-    inverse = np.linalg.inv(N)
-    # n_i . X = n_i . p_i + o_i: dX = N^-1 (do_i - dn_i . (X - p_i))
-    variance = np.array(
-        [
-            np.trace(p.point_covariance) + (point - p.point_m) @ p.direction_covariance @ (point - p.point_m)
-            for p in planes
-        ]
-    )
-    return RangeFeature(
-        kind=FeatureKind.POINT,
-        point_m=point,
-        point_covariance=inverse @ np.diag(variance) @ inverse.T,
-        direction=np.zeros(3),
-        direction_covariance=np.zeros((3, 3)),
-        labels=(a.label, b.label, c.label),
-    )
-
-
 def features_of(surfaces: Iterable[Surface]) -> tuple[RangeFeature, ...]:
     """Return the feature of each surface: a plane, the axis of a cylinder or cone, or the centre of any other."""
     out = []
@@ -198,13 +129,3 @@ def features_of(surfaces: Iterable[Surface]) -> tuple[RangeFeature, ...]:
         else:
             out.append(point_feature(surface))
     return tuple(out)
-
-
-def _jacobian(function, size: int, step: float) -> Array:  # type: ignore[no-untyped-def]  # numba types it
-    """Return the Jacobian of a function of `size` variables at zero, by central differences."""
-    columns = []
-    for k in range(size):
-        d = np.zeros(size)
-        d[k] = step
-        columns.append((function(d) - function(-d)) / (2.0 * step))
-    return np.stack(columns, axis=1)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from hal.arrays import Array
-from perception.range.noise import quadratics, window_rms
+from perception.range.quadratics import quadratics, window_rms
 from perception.range.sensor import RangeSensorModel
 
 SIDE = 9  # samples across a window

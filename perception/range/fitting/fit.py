@@ -3,7 +3,7 @@
 The error of the sensor lies along its ray, so the residual is `(z_measured - z_surface) / sigma(z)`. Orthogonal
 distances would bias a radius by about sigma^2 / (2 r), and by more at grazing rays. A fit starts robustly, with Cauchy
 weights whose scale falls from round to round; it ends with least squares on the residuals below `TRIM_SIGMAS`
-(Levenberg's damping, Marquardt's scaling).
+(see `refine`).
 """
 
 from __future__ import annotations
@@ -12,31 +12,18 @@ import numpy as np
 
 from hal.arrays import Array, Mask
 from hal.jit import as_numpy_scalar, compiled
+from perception.range.fitting.equations import MISS_SIGMAS, error_row, residuals_by_chunks
 from perception.range.fitting.initialisation import (
     is_ellipsoid,
     normal_axis,
     quadric_of_sphere,
-    solve_positive,
     start_cone,
     start_cylinder,
     start_plane,
     start_sphere,
 )
-from perception.range.fitting.rays import (
-    CHUNK,
-    ERRED,
-    ERROR,
-    FILLED,
-    LOADED,
-    MISS_SIGMAS,
-    NOTHING,
-    SCRATCH,
-    error_row,
-    fill_rows,
-    load_rows,
-    normal_equations,
-    residuals_by_chunks,
-)
+from perception.range.fitting.rays import CHUNK, ERROR, FILLED, LOADED, NOTHING, fill_rows, load_rows
+from perception.range.fitting.refine import new_scratch, refine
 from perception.range.fitting.surfaces import (
     CONE,
     CYLINDER,
@@ -46,7 +33,6 @@ from perception.range.fitting.surfaces import (
     SIZE,
     SPHERE,
     frame_of,
-    step_into,
 )
 
 TRIM_SIGMAS = 3.0  # samples with larger residuals are outliers in the final least squares
@@ -61,99 +47,8 @@ ELLIPSOID_GIVE_UP = 14.0
 LARGEST_RADIUS_M = 10.0  # fits of spheres and cylinders with a larger radius are rejected
 LEAST_NORMALS = 10  # normals needed to start any kind but a plane
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 per sample plus its parameter penalty
-STEP_GOAL = 1e-3  # in standard deviations of each parameter: smaller steps are negligible
 FIRST = as_numpy_scalar(0)
 AROUND_ZERO, AROUND_MEAN = as_numpy_scalar(False), as_numpy_scalar(True)  # centre of the scatter matrix of the normals
-
-
-@compiled
-def new_scratch(samples: int) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
-    """Allocate the work arrays of a fit to at most `samples` samples.
-
-    In this order: the rows of `rays`; matrix (9, 9) and gradient (9,) of the current parameters, and of the trial
-    parameters; matrix and vector of a step; tangent frames of the current and of the trial parameters; trial
-    parameters; residuals.
-    """
-    small = np.empty(3 * 81 + 3 * 9 + 2 * 6 + SIZE)  # one allocation instead of nine
-    H, H2, A = small[:81].reshape((9, 9)), small[81:162].reshape((9, 9)), small[162:243].reshape((9, 9))
-    g, g2, step = small[243:252], small[252:261], small[261:270]
-    frame, new_frame, trial = small[270:276], small[276:282], small[282:]
-    return np.empty(SCRATCH), H, g, H2, g2, A, step, frame, new_frame, trial, np.empty(samples)
-
-
-@compiled
-def refine(
-    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, steps: int, scale: float,
-    trim: float, fixed: Mask,
-    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array], held: int,
-) -> tuple[float, int, int]:  # fmt: skip
-    """Minimise the ray residuals with at most `steps` damped Gauss-Newton steps; updates the parameters `th` in place.
-
-    Args:
-        x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
-        scale: > 0: width of the Cauchy weights in sigmas; 0: trim at `trim` and plain least squares.
-        fixed: (9,) bool, tangent parameters that stay at their prior value.
-        scratch: work arrays of `new_scratch`.
-        held: which rows for these samples and `th` are valid in `scratch` (NOTHING, LOADED, ERRED or FILLED).
-
-    Returns:
-        cost, number of samples used, and which rows for the samples and the final `th` are valid in `scratch`.
-    """
-    work, H, g, H2, g2, A, step, frame, new_frame, trial, _ = scratch
-    p = FREEDOM[kind]
-    frame_of(kind, th, frame)
-    goes_on = steps > 0
-    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held, goes_on)
-    held = min(held, LOADED)
-    damping, is_fresh = 1e-4, True
-    for turn in range(steps):
-        damped(H, g, fixed, damping, p, A, step)
-        if not solve_positive(A, step, p):
-            damping *= 10.0
-            if damping > 1e6:
-                break
-            continue
-        small = 0.0
-        for a in range(p):
-            small = max(small, abs(step[a]) * np.sqrt(H[a, a]))
-        goes_on = turn + 1 < steps and not small < STEP_GOAL * 30.0
-        step_into(kind, th, frame, step, trial)
-        frame_of(kind, trial, new_frame)
-        new_cost, new_used = normal_equations(
-            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work, held, goes_on
-        )
-        is_fresh = new_cost <= cost and new_used >= p
-        if is_fresh:
-            cost, used = new_cost, new_used
-            for i in range(SIZE):
-                th[i] = trial[i]
-            for i in range(6):
-                frame[i] = new_frame[i]
-            if not goes_on:
-                break
-            for a in range(p):
-                g[a] = g2[a]
-                for b in range(p):
-                    H[a, b] = H2[a, b]
-            damping = max(damping * 0.2, 1e-9)
-        else:
-            damping *= 10.0
-            if damping > 1e6 or small < STEP_GOAL:
-                break
-    return cost, used, ERRED if is_fresh and held == LOADED else held
-
-
-@compiled
-def damped(H: Array, g: Array, fixed: Mask, damping: float, p: int, A: Array, step: Array) -> None:
-    """Write the damped linear system of one step into `A` (p, p) and `step` (p,); fixed parameters get a zero step.
-
-    `H` and `g` are the Gauss-Newton matrix and gradient; the diagonal of `H` is multiplied by 1 + `damping`.
-    """
-    for a in range(p):
-        for b in range(p):
-            A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
-        A[a, a] = A[a, a] * (1.0 + damping) + 1e-12 if not fixed[a] else 1.0
-        step[a] = 0.0 if fixed[a] else g[a]
 
 
 @compiled

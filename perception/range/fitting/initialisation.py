@@ -9,40 +9,10 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled
+from hal.small_algebra import solve_positive
 from perception.range.fitting.surfaces import SIZE, tangent_frame
 
 MOST_SWEEPS = 12  # of Jacobi rotations; a 3x3 matrix converges in four or five
-
-
-@compiled
-def solve_positive(A: Array, b: Array, p: int) -> bool:
-    """Solve A x = b (p unknowns) by Cholesky decomposition; returns False if A is not positive definite.
-
-    Overwrites `A` with the factor and `b` with the solution.
-    """
-    for i in range(p):
-        top = A[i, i]
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= A[i, k] * A[j, k]
-            if i == j:
-                if s <= 1e-13 * top:
-                    return False
-                A[i, i] = np.sqrt(s)
-            else:
-                A[i, j] = s / A[j, j]
-    for i in range(p):
-        s = b[i]
-        for k in range(i):
-            s -= A[i, k] * b[k]
-        b[i] = s / A[i, i]
-    for i in range(p - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, p):
-            s -= A[k, i] * b[k]
-        b[i] = s / A[i, i]
-    return True
 
 
 @compiled

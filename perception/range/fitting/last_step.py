@@ -9,9 +9,10 @@ import numpy as np
 
 from hal.arrays import Array, Labels, Mask
 from hal.jit import REORDERED, compiled
-from perception.range.fitting.fit import TRIM_SIGMAS, damped
-from perception.range.fitting.initialisation import solve_positive
-from perception.range.fitting.rays import CHUNK, SCRATCH, SIGMA, X, Y, Z, add_equations, fill_rows, mirror
+from perception.range.fitting.equations import add_equations, mirror
+from perception.range.fitting.fit import TRIM_SIGMAS
+from perception.range.fitting.rays import CHUNK, SCRATCH, SIGMA, X, Y, Z, fill_rows
+from perception.range.fitting.refine import free_step
 from perception.range.fitting.surfaces import FREEDOM, GRAZING_COSINE, PLANE, SIZE, frame_of, step_into
 
 
@@ -32,8 +33,7 @@ def last_step(
     frame_of(kind, th, frame)
     kept, used = _equations(kind, th, frame, depth, sen, noise, runs, np.empty(SCRATCH), H, g)
     A, step = np.empty((p, p)), np.empty(p)
-    damped(H, g, fixed, 0.0, p, A, step)
-    if used <= p or not solve_positive(A, step, p):
+    if used <= p or not free_step(H, g, fixed, 0.0, p, A, step):
         return th, H, kept, used
     for a in range(p):
         kept -= 0.0 if fixed[a] else g[a] * step[a]

@@ -81,25 +81,37 @@ def depth_on(kind: int, th: Array, x: float, y: float, perspective: bool) -> flo
         c = wx * wx + wy * wy + wz * wz - wa * wa - th[6] * th[6]
         return _roots(a, b, c, th[7])
     if kind == CONE:
-        da = dx * th[3] + dy * th[4] + th[5]
-        wa = wx * th[3] + wy * th[4] + wz * th[5]
-        k = np.cos(th[6]) ** 2
-        a = k * (dx * dx + dy * dy + 1.0) - da * da
-        b = k * (dx * wx + dy * wy + wz) - da * wa
-        c = k * (wx * wx + wy * wy + wz * wz) - wa * wa
-        disc = b * b - a * c
-        if disc < 0.0 or abs(a) < 1e-15:
-            return np.nan
-        root = np.sqrt(disc)
-        near, far = (-b - root) / a, (-b + root) / a
-        if near > far:
-            near, far = far, near
-        near_ok, far_ok = wa + near * da > 0.0, wa + far * da > 0.0
-        if near_ok and far_ok:
-            return float(near if th[7] > 0 else far)
-        if near_ok:
-            return float(near)
-        return far if far_ok else np.nan
+        return _depth_on_cone(th, wx, wy, wz, dx, dy)
+    return _depth_on_quadric(th, wx, wy, wz, dx, dy)
+
+
+@compiled
+def _depth_on_cone(th: Array, wx: float, wy: float, wz: float, dx: float, dy: float) -> float:
+    """Return the depth at which a ray meets a cone; w is its origin minus the apex, (dx, dy, 1) its direction."""
+    da = dx * th[3] + dy * th[4] + th[5]
+    wa = wx * th[3] + wy * th[4] + wz * th[5]
+    k = np.cos(th[6]) ** 2
+    a = k * (dx * dx + dy * dy + 1.0) - da * da
+    b = k * (dx * wx + dy * wy + wz) - da * wa
+    c = k * (wx * wx + wy * wy + wz * wz) - wa * wa
+    disc = b * b - a * c
+    if disc < 0.0 or abs(a) < 1e-15:
+        return np.nan
+    root = np.sqrt(disc)
+    near, far = (-b - root) / a, (-b + root) / a
+    if near > far:
+        near, far = far, near
+    near_ok, far_ok = wa + near * da > 0.0, wa + far * da > 0.0
+    if near_ok and far_ok:
+        return float(near if th[7] > 0 else far)
+    if near_ok:
+        return float(near)
+    return far if far_ok else np.nan
+
+
+@compiled
+def _depth_on_quadric(th: Array, wx: float, wy: float, wz: float, dx: float, dy: float) -> float:
+    """Return the depth at which a ray meets a quadric; w is its origin minus the centre, (dx, dy, 1) its direction."""
     inverse = 1.0 / th[3]
     wx, wy, wz = wx * inverse, wy * inverse, wz * inverse
     dx, dy, dz = dx * inverse, dy * inverse, inverse
@@ -131,13 +143,6 @@ def depth_on(kind: int, th: Array, x: float, y: float, perspective: bool) -> flo
         + th[13]
     )
     return _roots(a, b, c, 1.0)
-
-
-@compiled
-def depths_on(kind: int, th: Array, x: Array, y: Array, perspective: bool, out: Array) -> None:
-    """Write `depth_on` of arrays x, y (N,) into `out` (N,)."""
-    for i in range(x.shape[0]):
-        out[i] = depth_on(kind, th, x[i], y[i], perspective)
 
 
 @compiled
@@ -174,67 +179,6 @@ def normals_on(kind: int, th: Array, x: Array, y: Array, z: Array, perspective: 
         facing = nx * x[i] + ny * y[i] + nz if perspective else nz
         side = -1.0 if facing > 0.0 else 1.0
         out[i, 0], out[i, 1], out[i, 2] = side * nx, side * ny, side * nz
-
-
-@compiled
-def depth_and_jacobian(
-    kind: int, th: Array, frame: Array, x: float, y: float, perspective: bool, J: Array,
-) -> tuple[float, float]:  # fmt: skip
-    """Return depth and cosine of incidence of a ray; fills `J` (9,) with the derivatives dz / d(tangent parameters).
-
-    On the surface F = 0 the derivative is dz / dtheta = -(dF/dtheta) / (dF/dz). Depth is NaN where the ray misses.
-    `frame` is that of `frame_of`.
-    """
-    z = depth_on(kind, th, x, y, perspective)
-    if not np.isfinite(z):
-        return z, 0.0
-    if perspective:
-        px, py, dx, dy = x * z, y * z, x, y
-    else:
-        px, py, dx, dy = x, y, 0.0, 0.0
-    nx, ny, nz = normal_on(kind, th, px, py, z)
-    fz = nx * dx + ny * dy + nz
-    cosine = abs(fz) / np.sqrt(dx * dx + dy * dy + 1.0)
-    if abs(fz) < 1e-6:
-        return np.nan, 0.0
-    k = -1.0 / fz
-    e1x, e1y, e1z, e2x, e2y, e2z = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
-    if kind == PLANE:
-        J[0] = k * (px * e1x + py * e1y + z * e1z)
-        J[1] = k * (px * e2x + py * e2y + z * e2z)
-        J[2] = -k
-        return z, cosine
-    wx, wy, wz = px - th[0], py - th[1], z - th[2]
-    if kind == SPHERE:
-        J[0], J[1], J[2], J[3] = -k * nx, -k * ny, -k * nz, -k
-    elif kind == CYLINDER:
-        h = wx * th[3] + wy * th[4] + wz * th[5]
-        n1, n2 = nx * e1x + ny * e1y + nz * e1z, nx * e2x + ny * e2y + nz * e2z
-        J[0], J[1], J[2], J[3], J[4] = -k * n1, -k * n2, -k * h * n1, -k * h * n2, -k
-    elif kind == CONE:
-        h = wx * th[3] + wy * th[4] + wz * th[5]
-        q1, q2 = wx * e1x + wy * e1y + wz * e1z, wx * e2x + wy * e2y + wz * e2z
-        rho = np.sqrt(q1 * q1 + q2 * q2) + 1e-30
-        ca, sa = np.cos(th[6]), np.sin(th[6])
-        tilt = -(ca * h / rho + sa)
-        J[0], J[1], J[2] = -k * nx, -k * ny, -k * nz
-        J[3], J[4] = k * tilt * q1, k * tilt * q2
-        J[5] = -k * (rho * sa + h * ca)
-    else:
-        s = 1.0 / th[3]
-        wx, wy, wz = wx * s, wy * s, wz * s
-        gx = 2.0 * th[4] * wx + th[7] * wy + th[8] * wz + th[10]
-        gy = 2.0 * th[5] * wy + th[7] * wx + th[9] * wz + th[11]
-        gz = 2.0 * th[6] * wz + th[8] * wx + th[9] * wy + th[12]
-        slope = (gx * dx + gy * dy + gz) * s
-        if abs(slope) < 1e-12:
-            return np.nan, 0.0
-        k = -1.0 / slope
-        zz = wz * wz
-        J[0], J[1] = k * (wx * wx - zz), k * (wy * wy - zz)
-        J[2], J[3], J[4] = k * wx * wy, k * wx * wz, k * wy * wz
-        J[5], J[6], J[7], J[8] = k * wx, k * wy, k * wz, k
-    return z, cosine
 
 
 @compiled

@@ -12,7 +12,7 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import as_numpy_scalar, compiled
-from perception.range.fitting import rays
+from perception.range.fitting.equations import MISS_SIGMAS, residuals
 from perception.range.fitting.fit import fit_robust
 from perception.range.fitting.initialisation import start_plane
 from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, PLANE, SIZE, normals_on
@@ -174,7 +174,7 @@ def surface_normals(kind: int, th: Array, samples: Array, perspective: bool) -> 
 def residual_sizes(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
     """Return the absolute residuals (N,) along the rays, in sigmas; `MISS_SIGMAS` for a ray that misses."""
     e = np.empty(samples.shape[1])
-    rays.residuals(kind, th, samples[0], samples[1], samples[2], samples[3], perspective, e)
+    residuals(kind, th, samples[0], samples[1], samples[2], samples[3], perspective, e)
     for i in range(e.shape[0]):
-        e[i] = abs(e[i]) if np.isfinite(e[i]) else rays.MISS_SIGMAS
+        e[i] = abs(e[i]) if np.isfinite(e[i]) else MISS_SIGMAS
     return e

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array, Mask
 from hal.jit import as_numpy_scalar, compiled
+from hal.small_algebra import solve_positive
 from perception.range.fitting.fit import fit_robust
-from perception.range.fitting.initialisation import solve_positive
 from perception.range.fitting.last_step import last_step
 from perception.range.fitting.surfaces import FREEDOM, PLANE, SIZE, depth_on
 from perception.range.noise import NoiseModel

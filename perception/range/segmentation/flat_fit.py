@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.arrays import Array, Labels
 from hal.jit import as_numpy_scalar, compiled
-from perception.range.fitting.initialisation import solve_positive
+from hal.small_algebra import solve_positive
 
 BEND_RMS = 0.4  # sigmas; blocks are curved if a quadratic reduces the mean squared residual by more than its square
 BEND_F = 4.0  # F ratio that this reduction must also exceed to be significant

@@ -70,10 +70,7 @@ def grow_planes(
             owner[start] = BENT
             continue
         plane_from_coefficients(m, perspective, th)
-        x0, y0 = S[1] / S[0], S[2] / S[0]
-        scale = np.sqrt(max(S[3] / S[0] - x0 * x0 + S[5] / S[0] - y0 * y0, 1e-30))
-        flat, quadratic = squares_left(queue, count, table, x0, y0, scale)
-        bent = is_bent(flat, quadratic, count)
+        flat, bent = _bend(queue, count, table, S)
         for k in range(count):
             owner[queue[k]] = BENT if bent else first_label + found
         if bent:
@@ -86,6 +83,18 @@ def grow_planes(
         found += 1
     _hand_over(owner, place, free.ravel(), label.ravel(), tried.ravel())
     return ths[:found].copy(), counts[:found].copy(), mean2[:found].copy()
+
+
+@compiled
+def _bend(queue: Labels, count: int, table: Array, S: Array) -> tuple[float, bool]:
+    """Return the sum of squared residuals of `count` blocks from their plane, and whether a quadratic is clearly better.
+
+    `S` (9,): sums over the blocks, as `_grown` fills them.
+    """
+    x0, y0 = S[1] / S[0], S[2] / S[0]
+    scale = np.sqrt(max(S[3] / S[0] - x0 * x0 + S[5] / S[0] - y0 * y0, 1e-30))
+    flat, quadratic = squares_left(queue, count, table, x0, y0, scale)
+    return flat, is_bent(flat, quadratic, count)
 
 
 @compiled

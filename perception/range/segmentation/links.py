@@ -6,36 +6,8 @@ import numpy as np
 
 from hal.arrays import Array, Indices, Mask
 from hal.jit import compiled
+from hal.union_find import find, unite
 from perception.range.segmentation.tangents import STEADY_RMS
-from perception.range.segmentation.union_find import find, unite
-
-
-@compiled
-def smooth_links(
-    z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool, normal: Array, rms: Array,
-    cos_limit: float,
-) -> tuple[Mask, Mask]:  # fmt: skip
-    """Return which free blocks (h, w) are linked to the right and to the lower neighbour: depth and normal change little.
-
-    Args:
-        slope: largest slope that is not a jump, metres of depth per metre across, times the side of a block in pixels.
-        inverse_f: 1 / focal length (pinhole), or the pixel pitch (orthographic).
-        cos_limit: least cosine of the angle between the normals of linked blocks.
-    """
-    h, w = z.shape
-    right, down = np.zeros((h, w), np.bool_), np.zeros((h, w), np.bool_)
-    for r in range(h):
-        for c in range(w):
-            if free[r, c]:
-                limit = slope * (z[r, c] if perspective else 1.0) * inverse_f + 4.0 * sigma[r, c]
-                for s in range(2):
-                    i, j = r + s, c + 1 - s
-                    if i < h and j < w and free[i, j] and _is_smooth(z, normal, rms, r, c, i, j, limit, cos_limit):
-                        if s == 0:
-                            right[r, c] = True
-                        else:
-                            down[r, c] = True
-    return right, down
 
 
 @compiled
@@ -43,11 +15,19 @@ def smooth_components(
     blocks: Indices, z: Array, sigma: Array, free: Mask, slope: float, inverse_f: float, perspective: bool,
     normal: Array, rms: Array, cos_limit: float, least: int, most: int,
 ) -> tuple[Indices, Indices]:  # fmt: skip
-    """Return the `most` largest components, of at least `least` free blocks, that the links of `smooth_links` connect.
+    """Return the `most` largest components, of at least `least` blocks, of free blocks that are linked.
 
-    `blocks` (B,): flat indices of the free blocks, ascending; the other arguments are those of `smooth_links`. Returns
-    starts (n + 1,) and flat indices (N,): component k, the largest first, owns indices[starts[k] : starts[k + 1]], in
-    raster order.
+    Neighbours are linked where depth and normal change little between them.
+
+    Args:
+        blocks: (B,) flat indices of the free blocks, ascending.
+        slope: largest slope that is not a jump, metres of depth per metre across, times the side of a block in pixels.
+        inverse_f: 1 / focal length (pinhole), or the pixel pitch (orthographic).
+        cos_limit: least cosine of the angle between the normals of linked blocks.
+
+    Returns:
+        starts (n + 1,) and flat indices (N,): component k, the largest first, owns indices[starts[k] : starts[k + 1]],
+        in raster order.
     """
     h, w = z.shape
     parent, sizes = np.empty(h * w, np.int64), np.empty(h * w, np.int64)

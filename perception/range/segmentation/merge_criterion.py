@@ -12,8 +12,9 @@ import numpy as np
 
 from hal.arrays import Array, Mask
 from hal.jit import as_numpy_scalar, compiled
+from hal.small_algebra import solve_positive
 from perception.range.fitting import fit
-from perception.range.fitting.initialisation import solve_positive, start_plane
+from perception.range.fitting.initialisation import start_plane
 from perception.range.fitting.surfaces import PLANE, QUADRIC, SPHERE
 from perception.range.segmentation import bend
 from perception.range.segmentation.borders import step_and_turn
@@ -163,15 +164,9 @@ def judged(
                 goes_on, continued = True, _continued(PLANE, a, samples, perspective)
             if goes_on:
                 ths[own], there[own] = continued, True
-            best_kind, best_gain, is_near = -1, -np.inf, False
-            for k in np.flatnonzero(there):
-                kind, th = int(k), ths[k]
-                gain, near = _gain(
-                    kind, th, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
-                )
-                is_near |= near
-                if gain > best_gain:
-                    best_kind, best_gain = kind, gain
+            best_kind, best_gain, is_near = _best_fit(
+                ths, there, kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+            )
             if best_gain > 0.0 or is_near:
                 return max(best_gain, LEAST_GAIN), best_kind, ths[best_kind].copy()
         if both_flat and turn < UNEVEN_TURN_RAD:
@@ -204,6 +199,27 @@ def _joint_fits(
         points, points, normals, x, y, z, sigma, perspective, kinds, correlated, give_up
     )
     return ths, np.isfinite(score) & (kept > 0.5)
+
+
+@compiled
+def _best_fit(
+    ths: Array, there: Mask, kind_a: int, samples_a: Array, figures_a: Array, kind_b: int, samples_b: Array,
+    figures_b: Array, is_smooth: bool, perspective: bool,
+) -> tuple[int, float, bool]:  # fmt: skip
+    """Return the kind with the largest gain among those that are `there` (5,), its gain, and whether any lies near.
+
+    The kind is -1 where none is there. `ths` (5, SIZE): joint surface of each kind.
+    """
+    best_kind, best_gain, is_near = -1, -np.inf, False
+    for kind in range(there.shape[0]):
+        if there[kind]:
+            gain, near = _gain(
+                kind, ths[kind], kind_a, samples_a, figures_a, kind_b, samples_b, figures_b, is_smooth, perspective
+            )
+            is_near |= near
+            if gain > best_gain:
+                best_kind, best_gain = kind, gain
+    return best_kind, best_gain, is_near
 
 
 @compiled

@@ -86,17 +86,17 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
         labels (H, W), 0 = none; the surfaces that they index; and the noise model, widened if the residuals of the
         large planes are larger than the given one allows.
     """
-    found, grid, blocks, noise = _settled_planes(task, noise)
+    found, grid, blocks, noise = _planes_and_noise(task, noise)
     size = grid.size_px
     least = max(LEAST_CURVED_BLOCKS if size > 1 else 6, round(task.least_pixels / size**2))
     select_models(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
-    labels = _claimed(task, noise, blocks, found, size=size)
+    labels = _assign_all_pixels(task, noise, blocks, found, size=size)
     if size > 1:
-        labels = _finer(task, noise, labels, found, size=(size + 1) // 2)
+        labels = _add_small_surfaces(task, noise, labels, found, size=(size + 1) // 2)
     return labels, found, noise
 
 
-def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, Labels, NoiseModel]:
+def _planes_and_noise(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, Labels, NoiseModel]:
     """Grow planes on the coarse grid; repeat with wider noise while large planes scatter more than it allows."""
     depths = task.depths_m
     shape = (task.depth_m.shape[0], task.depth_m.shape[1])
@@ -113,7 +113,7 @@ def _settled_planes(task: Task, noise: NoiseModel) -> tuple[Candidates, Grid, La
     return found, grid, blocks, noise
 
 
-def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, size: int) -> Labels:
+def _add_small_surfaces(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, size: int) -> Labels:
     """Find surfaces that are too small for the coarse blocks among the unlabelled pixels; returns the new labels.
 
     Only patches that are large enough for the smallest surface are processed, and only the part of the image around
@@ -133,11 +133,11 @@ def _finer(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, 
     if len(found.kinds) == before:
         return labels
     inside = labels[top : top + left_over.shape[0], left : left + left_over.shape[1]]
-    inside[:] = np.where(inside > 0, inside, _claimed(part, noise, blocks, found, size=size))
-    return _reclaimed(task, noise, labels, found, newest=before + 1)
+    inside[:] = np.where(inside > 0, inside, _assign_all_pixels(part, noise, blocks, found, size=size))
+    return _reassign_beside(task, noise, labels, found, newest=before + 1)
 
 
-def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *, size: int) -> Labels:
+def _assign_all_pixels(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *, size: int) -> Labels:
     """Assign every pixel to the best surface of the blocks around it; returns labels (H, W)."""
     labels = np.zeros(task.depth_m.shape, np.int32)
     kinds, table = found.arrays()
@@ -151,11 +151,11 @@ def _claimed(task: Task, noise: NoiseModel, blocks: Labels, found: Candidates, *
     return labels
 
 
-def _reclaimed(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, newest: int) -> Labels:
+def _reassign_beside(task: Task, noise: NoiseModel, labels: Labels, found: Candidates, *, newest: int) -> Labels:
     """Reassign the pixels beside surfaces of label `newest` and later; returns `labels`, changed in place."""
-    rows, columns = _contested(task, labels, newest)
+    rows, columns = _contested_of_image(task, labels, newest)
     judge = partial(reassign_pixels, task.depth_m, task.packed, noise.packed(), labels, *found.arrays())
-    _judged(task, judge, labels, rows, columns)
+    _relabel(task, judge, labels, rows, columns)
     return labels
 
 
@@ -166,15 +166,15 @@ def icm_labels(task: Task, noise: NoiseModel, labels: Labels, found: Candidates,
     """
     slow = noise.slow_share(float(task.depths_m[2]))
     judge = partial(icm_sweep, task.depth_m, task.packed, noise.packed(), slow, labels, *found.arrays())
-    rows, columns = _contested(task, labels, 1)
+    rows, columns = _contested_of_image(task, labels, 1)
     for _ in range(sweeps):
-        moved = _judged(task, judge, labels, rows, columns)
+        moved = _relabel(task, judge, labels, rows, columns)
         # The decision for a pixel can change only if a label around it has changed.
         rows, columns = pixels_around(*moved, REACH_PX, labels.shape)
     return labels
 
 
-def _contested(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]:
+def _contested_of_image(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]:
     """Return rows and columns of the `contested_pixels` of the whole image, computed in tiles."""
     parts: dict[int, tuple[Labels, Labels]] = {}
 
@@ -186,7 +186,7 @@ def _contested(task: Task, labels: Labels, newest: int) -> tuple[Labels, Labels]
     return np.concatenate(rows), np.concatenate(columns)
 
 
-def _judged(
+def _relabel(
     task: Task, judge: Callable[..., object], labels: Labels, rows: Labels, columns: Labels
 ) -> tuple[Labels, Labels]:
     """Compute new labels of the pixels with `judge`, all from the current labels, and only then write them.

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array, Indices
 from hal.jit import compiled
+from hal.union_find import find, unite
 from perception.range.segmentation.boundary_pixels import WORD
 from perception.range.segmentation.run_length import row_ends
-from perception.range.segmentation.union_find import find, unite
 
 Labels = NDArray[np.int32]
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.union_find import find, unite
 
 
 def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
@@ -44,7 +45,7 @@ def _components(mask: NDArray[np.uint8], reach: int) -> Array:
                 if first[k] > last[made] + reach:
                     break
                 if last[k] >= first[made] - reach:
-                    _join(parent, k, made)
+                    unite(parent, k, made)
             made += 1
         above = begin
     return _boxes(parent[:made], first, last, row)
@@ -59,7 +60,7 @@ def _boxes(
     sums = np.zeros((len(parent), 7))  # left, top, right, bottom, u, v, area
     count = 0
     for k in range(len(parent)):
-        root = _root(parent, k)
+        root = find(parent, k)
         if number[root] < 0:
             number[root] = count
             sums[count, 0], sums[count, 1] = first[k], row[k]
@@ -77,22 +78,3 @@ def _boxes(
         out[k, 2], out[k, 3] = part[2] - part[0] + 1.0, part[3] - part[1] + 1.0
         out[k, 4], out[k, 5] = part[4] / part[6], part[5] / part[6]
     return out
-
-
-@inlined
-def _root(parent: NDArray[np.int32], k: int) -> int:
-    """Return the root of run k."""
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
-
-
-@inlined
-def _join(parent: NDArray[np.int32], a: int, b: int) -> None:
-    """Join two sets of runs; the older root remains the root."""
-    ra, rb = _root(parent, a), _root(parent, b)
-    if ra < rb:
-        parent[rb] = ra
-    else:
-        parent[ra] = rb

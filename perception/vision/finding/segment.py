@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array, Image
 from hal.jit import compiled, inlined
+from hal.union_find import find
 from perception.vision.noise import noise_sigma
 
 TOLERANCE = 9.0  # gray levels; least tolerance
@@ -62,15 +63,6 @@ def grow_regions(gray: Image, *, tolerance: float | None = None) -> ImageRegions
         labels=labels, area_px=count, mean=mean, variance=np.maximum(sums[:, 2] / count - mean**2, 0.0),
         middle_px=sums[:, 3:5] / count[:, None], box_px=box,
     )  # fmt: skip
-
-
-@inlined
-def _root(parent: NDArray[np.int32], k: int) -> int:
-    """Return the root of region k."""
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
 
 
 @inlined
@@ -151,7 +143,7 @@ def _grow(gray: Image, tolerance: float) -> tuple[NDArray[np.int32], Array]:  # 
             value = np.int64(grays[u])
             if row_above[u] != above:
                 above = row_above[u]
-                up_root = _root(parent, above)
+                up_root = find(parent, above)
             if up_root == left and left >= 0 and _fits(n, total, squares, value, tolerance):
                 n, total, squares = n + 1, total + value, squares + value * value
                 row[u] = left
@@ -201,7 +193,7 @@ def _numbered(labels: NDArray[np.int32], parent: NDArray[np.int32], sums: Array)
             out[count] = sums[k]
             count += 1
     for k in range(len(parent)):
-        number[k] = number[_root(parent, k)]
+        number[k] = number[find(parent, k)]
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
             labels[v, u] = number[labels[v, u]]

@@ -6,7 +6,8 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
-from perception.vision.quadrangle.cost import solve_damped
+from hal.small_algebra import factor, solve_lower, solve_upper
+from perception.vision.quadrangle.cost import LEAST_PIVOT
 from perception.vision.quadrangle.three_point import cofactors, real_cubic_root
 
 
@@ -102,13 +103,14 @@ def plane_of(X: Array) -> tuple[Array, float]:
 @compiled
 def inverse6(N: Array, out: Array) -> bool:
     """Compute the inverse of a 6x6 matrix into `out`; returns False if the matrix is not positive definite."""
-    g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
+    x, L = np.empty(6), np.zeros((6, 6))
+    if not factor(N, N, 0.0, 0.0, LEAST_PIVOT, L, 6):
+        return False
     for k in range(6):
         for i in range(6):
-            g[i] = 0.0
-        g[k] = -1.0
-        if not solve_damped(N, N, 0.0, g, x, L):
-            return False
+            x[i] = 1.0 if i == k else 0.0
+        solve_lower(L, x, 6)
+        solve_upper(L, x, 6)
         for i in range(6):
             out[i, k] = x[i]
     for i in range(6):
@@ -120,8 +122,8 @@ def inverse6(N: Array, out: Array) -> bool:
 @inlined
 def log_det6(C: Array) -> float:
     """Return the log determinant of a positive definite 6x6 matrix."""
-    g, x, L = np.zeros(6), np.empty(6), np.zeros((6, 6))
-    solve_damped(C, C, 0.0, g, x, L)
+    L = np.zeros((6, 6))
+    factor(C, C, 0.0, 0.0, LEAST_PIVOT, L, 6)
     total = 0.0
     for i in range(6):
         total += 2.0 * np.log(L[i, i])

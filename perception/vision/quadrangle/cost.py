@@ -11,10 +11,13 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.least_squares import DampingRule, next_damping, solve_damped
 from perception.vision.quadrangle.small_vectors import cross3, mix3, product3
 
 CONVERGED = 1e-9  # predicted decrease of chi-square at which to stop: 3e-5 of a standard deviation
 MAX_STEPS = 60
+RULE = DampingRule(fall=0.1, rise=8.0, least=0.0, restart=1e-4, most=1e12)
+LEAST_PIVOT = 1e-14  # relative to the Gauss-Newton matrix; below it the Hessian counts as indefinite
 
 
 @inlined
@@ -170,37 +173,18 @@ def bend(y0: float, y1: float, y2: float, iz: float, u: float, v: float, lu: flo
     H[5, 5] += gz * y2 - dot
 
 
-@compiled
-def solve_damped(M: Array, D: Array, damping: float, g: Array, x: Array, L: Array) -> bool:
-    """Compute x = -(M + damping diag(D))^-1 g by Cholesky decomposition; returns False if it is not positive definite.
+@inlined
+def newton_step(H: Array, N: Array, damping: float, fallback: float, g: Array, x: Array, L: Array) -> float:
+    """Fill x (n,) with the damped Newton step at gradient g; returns the predicted decrease, -1 where there is no step.
 
-    The factor is left in L.
+    Where the Hessian H is indefinite, the step is that of the Gauss-Newton matrix N, damped by `fallback`. `L` (n, n)
+    receives the Cholesky factor.
     """
     n = g.shape[0]
     for i in range(n):
-        for j in range(i + 1):
-            s = M[i, j]
-            if i == j:
-                s += damping * D[i, i]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 1e-14 * D[i, i]:
-                    return False
-                L[i, i] = np.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    for i in range(n):
-        s = -g[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for i in range(n - 1, -1, -1):
-        s = x[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
-    return True
+        x[i] = -g[i]
+    fall = solve_damped(H, N, damping, 0.0, LEAST_PIVOT, x, L, n)
+    return fall if fall >= 0.0 else solve_damped(N, N, fallback, 0.0, LEAST_PIVOT, x, L, n)
 
 
 @compiled
@@ -221,12 +205,10 @@ def minimise(R: Array, t: Array, X: Array, m: Array, A: Array) -> tuple[Array, A
     steps = 0
     while steps < MAX_STEPS:
         steps += 1
-        if not solve_damped(H, N, damping, g, x, L) and not solve_damped(N, N, damping, g, x, L):
-            damping = max(10.0 * damping, 1e-6)
+        fall = newton_step(H, N, damping, damping, g, x, L)
+        if fall < 0.0:
+            damping = next_damping(damping, False, RULE)
             continue
-        fall = 0.0
-        for a in range(6):
-            fall -= g[a] * x[a]
         R_new = product3(rotation_of(x[3:]), R)
         t_new = mix3(1.0, t, 1.0, x)
         if fall < CONVERGED:
@@ -235,12 +217,11 @@ def minimise(R: Array, t: Array, X: Array, m: Array, A: Array) -> tuple[Array, A
                 return R_new, t_new, cost_new, N, steps
             return R, t, cost, N, steps
         cost_new = chi_square(R_new, t_new, X, m, A)
-        if cost_new < cost:
+        is_lower = cost_new < cost
+        if is_lower:
             R, t = R_new, t_new
             cost = expand(R, t, X, m, A, g, N, H)
-            damping = damping * 0.1 if damping > 1e-9 else 0.0
-        else:
-            damping = max(8.0 * damping, 1e-4)
-            if damping > 1e12:
-                break
+        damping = next_damping(damping, is_lower, RULE)
+        if damping > RULE.most:
+            break
     return R, t, cost, N, steps

@@ -7,8 +7,9 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.small_algebra import put1, put2
 from perception.vision.quadrangle.cost import chi_square, minimise, turn_onto
-from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, put1, put2, times3, unit3
+from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, times3, unit3
 from perception.vision.quadrangle.three_point import three_point
 
 

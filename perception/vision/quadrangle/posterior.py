@@ -9,8 +9,9 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
-from perception.vision.quadrangle.cost import chi_square, expand, rotation_of, solve_damped, turn_onto
-from perception.vision.quadrangle.small_vectors import back3, cross3, dot3, mix3, product3, put1, times3, unit3
+from hal.small_algebra import put1
+from perception.vision.quadrangle.cost import chi_square, expand, newton_step, rotation_of, turn_onto
+from perception.vision.quadrangle.small_vectors import back3, cross3, dot3, mix3, product3, times3, unit3
 
 MIRROR_TURN_COS = 0.99619469809  # 5 degrees: poses whose normals are nearer than this count as one
 RING_STEP_RAD = 0.10471975512  # 6 degrees; 2.5 degrees gave the same mass (correlation 0.999 over 8000 problems)
@@ -40,7 +41,7 @@ def profile(
         for i in range(3):
             g4[i] = g[i]
         g4[3] = g[3] * direction[0] + g[4] * direction[1] + g[5] * direction[2]
-        if not solve_damped(H4, N4, 0.0, g4, x4, L4) and not solve_damped(N4, N4, 1e-6, g4, x4, L4):
+        if newton_step(H4, N4, 0.0, 1e-6, g4, x4, L4) < 0.0:
             break
         step = 1.0
         improved = False

@@ -6,10 +6,11 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.small_algebra import put1, put2
 from perception.vision.quadrangle.arrays import inverse6, log_det6, move_origin, plane_of, prepare
 from perception.vision.quadrangle.minima import all_minima
 from perception.vision.quadrangle.posterior import MIRROR_TURN_COS, normal_spread, opposite, ring_mass, sight_frame
-from perception.vision.quadrangle.small_vectors import mix3, put1, put2, times3
+from perception.vision.quadrangle.small_vectors import mix3, times3
 
 WORTHLESS = 60.0  # a minimum with a chi-square so far above the best has odds of 1 in 1e13
 
@@ -67,9 +68,7 @@ def solve(
             put2(Rs[count], R)
             put1(ts[count], t)
             costs[count], masses[count] = cost, ratio
-            for i in range(6):
-                for j in range(6):
-                    Cs[count, i, j] = 0.0
+            Cs[count, :, :] = 0.0
             count += 1
     for k in range(count):
         lever = times3(Rs[k], c)

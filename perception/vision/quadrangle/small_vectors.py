@@ -72,18 +72,3 @@ def unit3(a: Array) -> Array:
     for i in range(3):
         x[i] = a[i] / norm
     return x
-
-
-@inlined
-def put1(into: Array, values: Array) -> None:
-    """Copy a vector into another."""
-    for i in range(values.shape[0]):
-        into[i] = values[i]
-
-
-@inlined
-def put2(into: Array, values: Array) -> None:
-    """Copy a matrix into another."""
-    for i in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            into[i, j] = values[i, j]

@@ -9,7 +9,8 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
-from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, put2, unit3
+from hal.small_algebra import put2
+from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, unit3
 
 
 @inlined

@@ -13,15 +13,14 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.errors import ConfigError, InvalidRequest, NotFound
-from perception.range import SurfaceType, analyse
+from perception.range import analyse
 from perception.range.batch import analyse_files, batch_range, recordings_in, tasks_of
 from perception.range.batch_results import write_results
-from perception.range.features import FeatureKind, corner_point, crease_line
 from perception.range.from_points import image_from_points
 from perception.range.recordings import Reading, assumptions, load_recording
 from perception.range.render import MARK, picture, scene_json, write_ply, write_png
 from perception.range.sensor import PinholeSensor
-from tests.perception.range.scenes import PINHOLE, ball_on_table, nearest, noisy, plane_depth
+from tests.perception.range.scenes import PINHOLE, ball_on_table, noisy
 
 META = {"unit": "m", "sensor": {"kind": "pinhole", "shape": [120, 160], "f": 180.0, "cx": 79.5, "cy": 59.5}}
 
@@ -220,40 +219,3 @@ def test_an_image_of_points_shows_the_nearest_in_each_pixel_and_needs_one():
     for unseen in (np.empty((0, 3)), np.array([[0.0, 0.0, -1.0], [90.0, 0.0, 1.0]])):
         with pytest.raises(NotFound):
             image_from_points(unseen, here, PINHOLE)
-
-
-def three_walls(seed):
-    point = np.array([0.01, -0.02, 0.7])
-    normals = [np.array(n) / np.linalg.norm(n) for n in ([-0.8, 0.0, -0.6], [0.8, 0.1, -0.6], [0.0, -0.8, -0.6])]
-    depth = np.max([plane_depth(PINHOLE, n, point) for n in normals], axis=0)
-    return noisy(depth, 0.0006, seed), normals, point
-
-
-def test_creases_and_corners_match_their_covariance():
-    squares_line, squares_point = [], []
-    for seed in range(25):
-        depth, normals, point = three_walls(seed)
-        planes = analyse(depth, PINHOLE).of_type(SurfaceType.PLANE)
-        assert len(planes) == 3
-        ordered = [max(planes, key=lambda s, n=n: s.primitive.normal @ n) for n in normals]
-        line = crease_line(ordered[0], ordered[1])
-        true = np.cross(normals[0], normals[1])
-        true /= np.linalg.norm(true)
-        turn = np.cross(line.direction, true * np.sign(true @ line.direction))
-        away = (line.point_m - point) - true * (true @ (line.point_m - point))
-        assert line.kind == FeatureKind.LINE
-        squares_line.append(
-            [turn @ turn / np.trace(line.direction_covariance), away @ away / np.trace(line.point_covariance)]
-        )
-        corner = corner_point(*ordered)
-        e = corner.point_m - point
-        squares_point.append(e @ np.linalg.solve(corner.point_covariance, e) / 3)
-    assert (np.mean(squares_line, axis=0) < 2.0).all() and (np.mean(squares_line, axis=0) > 0.4).all()
-    assert 0.4 < np.mean(squares_point) < 2.0
-
-
-def test_parallel_planes_meet_nowhere():
-    low, high = (plane_depth(PINHOLE, np.array([0.0, 0.0, -1.0]), np.array([0, 0, z])) for z in (0.6, 0.5))
-    high[:, 80:] = np.inf
-    planes = analyse(noisy(nearest(low, high).depth_m, 0.0005, 0), PINHOLE).of_type(SurfaceType.PLANE)
-    assert len(planes) == 2 and crease_line(*planes) is None

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, SIZE, SPHERE, depths_on
+from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, SIZE, SPHERE
 from perception.range.noise import NoiseModel
 from perception.range.segmentation.bend import scrap_gain, simplest, straightened, turn_of
 from perception.range.segmentation.join import join_pieces
 from perception.range.segmentation.merge import merge_touching
 from perception.range.segmentation.regions import regions_of
+from tests.perception.range.reference import depths_on
 
 WHITE = NoiseModel(white=(0.002, 0.0), correlated=(0.0, 0.0), step=(0.0, 0.0))
 SLOW = NoiseModel(white=(0.001, 0.0), correlated=(0.004, 0.0), step=(0.0, 0.0))
@@ -38,8 +39,7 @@ def rays(mask):
 def sampled(kind, th, mask, noise, *, seed=0, sigma=1.0):
     """Return the (4, N) samples of the pixels in `mask`, with white noise of `sigma` times the model's."""
     x, y = rays(mask)
-    z = np.empty(x.size)
-    depths_on(kind, th, x, y, True, z)
+    z = depths_on(kind, th, x, y, True)
     assert np.isfinite(z).all()
     scatter = noise.sigma_m(z)
     z = z + sigma * scatter * np.random.default_rng(seed).normal(size=z.size)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range.fitting.surfaces import CYLINDER, SIZE, depths_on
+from perception.range.fitting.surfaces import CYLINDER, SIZE
 from perception.range.noise import NoiseModel
 from perception.range.segmentation.finish import refine_surface
 from perception.range.segmentation.regions import regions_of
+from tests.perception.range.reference import depths_on
 
 SHAPE = (120, 160)
 PACKED = np.array([1.0, 240.0, 240.0, 79.5, 59.5])
@@ -27,6 +28,5 @@ def test_a_face_that_hardly_bends_keeps_its_surface_before_the_sensor(seed):
     start[:8] = 0.0, 0.0, 10.0, 1.0, 0.0, 0.0, 8.0, 1.0
     regions = regions_of(depth, PACKED, NOISE.packed(), labels, 1)
     _, th = refine_surface(1, CYLINDER, start, regions, 1, noise=NOISE)
-    z = np.empty(int(labels.sum()))
-    depths_on(CYLINDER, th, x[labels == 1], y[labels == 1], True, z)
+    z = depths_on(CYLINDER, th, x[labels == 1], y[labels == 1], True)
     np.testing.assert_allclose(z, depth[labels == 1], atol=0.02)

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from perception.range.fitting.equations import MISS_SIGMAS
 from perception.range.fitting.fit import PER_MEDIAN, SCALE_PRECISION, TRIM_SIGMAS, middle_scale
 from perception.range.fitting.initialisation import principal_axes
 from perception.range.fitting.last_step import last_step
-from perception.range.fitting.rays import MISS_SIGMAS
 from perception.range.fitting.surfaces import (
     CYLINDER,
     FREEDOM,
@@ -21,8 +21,6 @@ from perception.range.fitting.surfaces import (
     QUADRIC,
     SIZE,
     SPHERE,
-    depth_and_jacobian,
-    depths_on,
     frame_of,
     step_into,
 )
@@ -31,6 +29,7 @@ from perception.range.primitives import centre_and_radii, ellipsoid_of, named_co
 from perception.range.segmentation import boundary_pixels, finish, pixel_assignment
 from perception.range.segmentation.regions import regions_of
 from perception.range.sensor import OrthographicSensor
+from tests.perception.range.reference import depth_and_jacobian, depths_on
 from tests.perception.range.scenes import PARALLEL, PINHOLE
 
 NOISE = NoiseModel(white=(0.0005, 0.0002), correlated=(0.0, 0.0003), step=(0.0004, 0.0))
@@ -144,8 +143,8 @@ def test_samples_of_each_label_come_in_raster_order(sensor):
 def test_the_last_step_over_runs_is_that_of_the_normal_equations_of_all_pixels(sensor, kind):
     th, free, rng = competing_surfaces()[kind + 1], np.zeros(9, bool), np.random.default_rng(5)
     packed, (v, u) = sensor.packed(), np.mgrid[:120, :160]
-    x, y, depth = (u - packed[3]) / packed[1], (v - packed[4]) / packed[2], np.empty(u.shape)
-    depths_on(kind, th, x.ravel(), y.ravel(), bool(packed[0] > 0), depth.ravel())
+    x, y = (u - packed[3]) / packed[1], (v - packed[4]) / packed[2]
+    depth = depths_on(kind, th, x.ravel(), y.ravel(), bool(packed[0] > 0)).reshape(u.shape)
     labels = (np.isfinite(depth) & (rng.random(depth.shape) < 0.9)).astype(np.int32)
     depth += 1.4 * NOISE.sigma_m(0.6) * rng.normal(size=depth.shape)
     inside = labels == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.range.fitting import rays
+from perception.range.fitting import equations, rays
 from perception.range.fitting.surfaces import (
     CONE,
     CYLINDER,
@@ -15,9 +15,9 @@ from perception.range.fitting.surfaces import (
     QUADRIC,
     SIZE,
     SPHERE,
-    depth_and_jacobian,
     frame_of,
 )
+from tests.perception.range.reference import depth_and_jacobian
 
 CENTRE = np.array([0.01, 0.02, 0.6])
 KINDS = [PLANE, SPHERE, CYLINDER, CONE, QUADRIC]
@@ -96,14 +96,14 @@ def test_sums_are_those_of_numpy(kind, scale, perspective):
     z[::17] += 0.05
     H, g = np.ones((9, 9)), np.ones(9)
     given = (kind, th, frame, x, y, z, sigma, perspective, scale, 3.0, H, g, np.empty(rays.SCRATCH), rays.NOTHING)
-    assert rays.normal_equations(*given, False) == rays.normal_equations(*given, True)
-    cost, used = rays.normal_equations(*given, True)
+    assert equations.normal_equations(*given, False) == equations.normal_equations(*given, True)
+    cost, used = equations.normal_equations(*given, True)
 
     hit = np.isfinite(truth)
     w = np.where(hit, np.minimum(1.0, cosine / GRAZING_COSINE) / sigma, 0.0)
-    e = np.where(hit, (z - np.nan_to_num(truth)) * w, rays.MISS_SIGMAS)
+    e = np.where(hit, (z - np.nan_to_num(truth)) * w, equations.MISS_SIGMAS)
     if scale:
-        c2 = (scale * rays.CAUCHY_WIDTH) ** 2
+        c2 = (scale * equations.CAUCHY_WIDTH) ** 2
         weight, wanted_cost = hit / (1.0 + e**2 / c2), c2 * np.log1p(e**2 / c2).sum()
     else:
         weight = hit & (np.abs(e) <= 3.0)
@@ -123,7 +123,7 @@ def test_residuals_are_in_sigmas_and_nan_where_a_ray_misses():
     th[:5] = [0.0, 0.0, 0.6, 0.1, 1.0]
     x, y, z = np.array([0.0, 0.0, 0.5]), np.zeros(3), np.array([0.5, 0.502, 0.6])
     out = np.empty(3)
-    rays.residuals(SPHERE, th, x, y, z, np.full(3, 1e-3), True, out)
+    equations.residuals(SPHERE, th, x, y, z, np.full(3, 1e-3), True, out)
     np.testing.assert_allclose(out, [0.0, 2.0, np.nan], atol=1e-9)
 
 
@@ -144,6 +144,6 @@ def test_sums_do_not_depend_on_where_the_samples_lie_in_memory():
         for part, values in zip(parts, samples, strict=True):
             part[:] = values
         H, g = np.zeros((9, 9)), np.zeros(9)
-        cost, _ = rays.normal_equations(SPHERE, th, frame, *parts, False, 0.0, 3.0, H, g, work, rays.NOTHING, True)
+        cost, _ = equations.normal_equations(SPHERE, th, frame, *parts, False, 0.0, 3.0, H, g, work, rays.NOTHING, True)
         seen.add((cost, H.tobytes(), g.tobytes()))
     assert len(seen) == 1

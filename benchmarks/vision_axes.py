@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from benchmarks.vision_drawing import Disturbance, Shown, camera, draw_panel, looking_at
+from benchmarks.vision_disturbance import Disturbance
+from benchmarks.vision_drawing import Shown, camera, draw_panel, looking_at
 from benchmarks.vision_reliability import Answer
 from hal.config import load_cell
 from hal.errors import CellError

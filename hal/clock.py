@@ -136,25 +136,6 @@ class PacedClock:
         return self._now_s + max(0.0, wall_s - self._ticked_at_s - IDLE_S)
 
 
-class ReplayClock:
-    """A clock that follows a recording: `now_s` is the stamp of the newest record that was replayed."""
-
-    def __init__(self, *, start_s: float = 0.0) -> None:
-        self._now_s = start_s
-
-    def now_s(self) -> float:
-        """Return the recorded time in seconds."""
-        return self._now_s
-
-    def seek(self, stamp_s: float) -> None:
-        """Advance to the stamp of the record that is replayed now."""
-        self._now_s = max(self._now_s, stamp_s)
-
-    def sleep(self, duration_s: float) -> None:
-        """Return at once, because the time of a recording does not depend on waiting."""
-        self._now_s += max(0.0, duration_s)
-
-
 @dataclass(frozen=True, slots=True)
 class Deadline:
     """A time on a clock by which a call must have returned, including its retries."""

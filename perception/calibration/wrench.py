@@ -78,14 +78,6 @@ def calibrate_wrench(
     return WrenchCalibration(load=load, covariance=covariance, rms_n=rms_n, rms_nm=rms_nm)
 
 
-def unload(wrench: ArrayLike, base_from_sensor: ArrayLike, load: ToolLoad) -> Array:
-    """Return the external wrench (6,) on the tool: the reading minus bias and weight."""
-    g = np.asarray(base_from_sensor, float).T @ np.array([0.0, 0.0, -GRAVITY_M_PER_S2])
-    weight = load.mass_kg * g
-    own = np.concatenate([weight, np.cross(load.centre_of_mass_m, weight)]) + load.bias
-    return np.asarray(np.asarray(wrench, float) - own)
-
-
 def _checked(base_from_sensor: ArrayLike, wrenches: ArrayLike, gravity_base: ArrayLike) -> tuple[Array, Array, Array]:
     """Return the arguments of `calibrate_wrench` as arrays.
 

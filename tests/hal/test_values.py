@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from hal import errors
-from hal.clock import Deadline, PacedClock, ReplayClock, SimClock
+from hal.clock import Deadline, PacedClock, SimClock
 from hal.errors import CellError, ConfigError, DeviceTimeout, InvalidRequest, Retry, StaleReading
 from hal.frames import FrameTree
 from hal.geometry import UncertainPose, certain, identity, transform_rpy
@@ -96,14 +96,6 @@ def test_a_paced_clock_does_not_count_the_time_that_a_tick_took_too_long() -> No
     clock.sleep(0.002)
     clock.sleep(0.002)
     assert clock.now_s() - clock.at_s(walls[1]) == pytest.approx(0.002)
-
-
-def test_a_replay_clock_never_goes_back() -> None:
-    clock = ReplayClock(start_s=5.0)
-    clock.seek(4.0)
-    assert clock.now_s() == 5.0
-    clock.seek(6.0)
-    assert clock.now_s() == 6.0
 
 
 def test_a_deadline_counts_on_its_own_clock() -> None:

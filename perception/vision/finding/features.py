@@ -4,8 +4,7 @@ On circles of growing radius around a middle, independent of the object's rotati
 (inner 70 % range), and edge strength (median and strong). Then, towards eight directions of the upright plate, relative
 gray and edges on rings: a toggle's plate is taller than wide, a display wider than high. The features are logarithms of
 ratios to the plate's own gray, so exposure and light cancel; medians and directions confine the effect of a cable or a
-highlight to a few features. For closed regions: the paper's size, height, width, aspect and Fourier shape descriptors
-(C. T. Zahn and R. Z. Roskies, IEEE Trans. Computers 21(3), 1972, in the complex form of G. H. Granlund, 1972).
+highlight to a few features.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ EACH = len(ANGLES) // DIRECTIONS
 # (angles, DIRECTIONS) mean over two radii and the angles about a direction
 TOWARDS = np.roll(np.kron(np.eye(DIRECTIONS), np.full((EACH, 1), 0.5 / EACH)), -(EACH // 2), axis=0).astype(np.float32)
 EDGE_GAIN = 40.0
-DESCRIPTORS = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,25 +41,6 @@ class Ground:
     edges: Edges
     plate_gray: NDArray[np.float32]
     noisy: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegionShape:
-    """The paper's spatial features of a closed region.
-
-    Attributes:
-        area_px, width_px, height_px: size; width and height of the upright box.
-        aspect: longer over shorter side of the smallest enclosing rectangle.
-        descriptors: magnitudes of the contour's Fourier coefficients 2..13 relative to the first, which do not depend
-        on
-            position, size and orientation.
-    """
-
-    area_px: float
-    width_px: float
-    height_px: float
-    aspect: float
-    descriptors: tuple[float, ...]
 
 
 def plate_gray(picture: Image) -> NDArray[np.float32]:
@@ -109,34 +88,3 @@ def _around(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the means (N, DIRECTIONS * RINGS) of values (N, radii, angles), direction by direction."""
     rings = values[:, : 2 * RINGS].reshape(len(values), RINGS, 2, -1).sum(axis=2)
     return np.asarray((rings @ TOWARDS).transpose(0, 2, 1).reshape(len(values), -1))
-
-
-def region_shape(mask: NDArray[np.bool_]) -> RegionShape | None:
-    """Return the shape of the largest part of a mask; None if it has less than 8 pixels."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if not contours:
-        return None
-    contour = max(contours, key=cv2.contourArea).reshape(-1, 2).astype(np.int32)
-    area = float(cv2.contourArea(contour))
-    if area < 8.0:
-        return None
-    _, _, width, height = cv2.boundingRect(contour)
-    (_, _), (a, b), _ = cv2.minAreaRect(contour)
-    return RegionShape(
-        area_px=area,
-        width_px=float(width),
-        height_px=float(height),
-        aspect=float(max(a, b) / max(min(a, b), 1e-9)),
-        descriptors=_fourier(contour),
-    )
-
-
-def _fourier(contour: NDArray[np.int32]) -> tuple[float, ...]:
-    """Return the Fourier shape descriptors of a closed contour (N, 2)."""
-    closed = np.vstack([contour, contour[:1]]).astype(float)
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
-    s = np.linspace(0.0, length[-1], 128, endpoint=False)
-    z = np.interp(s, length, closed[:, 0]) + 1j * np.interp(s, length, closed[:, 1])
-    spectrum = np.abs(np.fft.fft(z))
-    first = max(float(spectrum[1]), float(spectrum[-1]), 1e-9)
-    return tuple(float(spectrum[k] + spectrum[-k]) / first for k in range(2, 2 + DESCRIPTORS))

@@ -75,17 +75,6 @@ def nearest_look(look: Array, kind: TaughtKind, knowledge: Knowledge) -> int:
     return int((difference @ knowledge.weights).argmin())
 
 
-def distances_reference(looks: Array, knowledge: Knowledge, *, mean_of: int = 1) -> Array:
-    """Compute `distances`, or `nearest` with `mean_of`, in plain numpy; a reference for tests."""
-    columns = []
-    for kind in knowledge.kinds:
-        difference = np.abs(looks[:, None] - kind.looks[None]) / knowledge.spread
-        near = np.sort(np.average(np.minimum(difference, CLIP), axis=2, weights=knowledge.weights), axis=1)[:, :mean_of]
-        lacking = np.arange(1, mean_of - near.shape[1] + 1)
-        columns.append(np.hstack([near, near[:, -1:] + NEXT_FURTHER * lacking]).mean(axis=1))
-    return np.column_stack(columns)
-
-
 def nothing_column(knowledge: Knowledge) -> int | None:
     """Return the column of `distances` for the kind `nothing`; None if it is not taught."""
     names = [kind.name for kind in knowledge.kinds]

@@ -21,7 +21,7 @@ from perception.vision.photographs.drop import find_drop, with_halo
 from perception.vision.photographs.scale_ends import scale_ends
 from perception.vision.reading import ANSWER_AT, PatchReading, answer_at, gated, limited, refused
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence, status_of_pointer
-from perception.vision.status.pointer import PointerFit, find_pointer, unroll, wrapped
+from perception.vision.status.pointer import PointerFit, PointerSearch, find_pointer, unroll, wrapped
 
 NUMERALS_FROM, TIP_AT = 0.45, 0.72  # shares of the radius: beyond any round hub, and within every pointer
 LEAST_CONNECTED = 0.7  # share of the way to the hub; a pointer comes from the hub, unlike glare or a numeral
@@ -131,11 +131,12 @@ def _lines(picture: Image, u: float, v: float, radius: float) -> tuple[list[Poin
         patch = _patch(channel, u, v)
         fits.append([])
         for dark in (True, False):
-            fit = find_pointer(
-                patch, pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
-                fine_m=(0.35 * radius, 0.78 * radius), width_rad=np.deg2rad(50.0), quantile=0.4, dark=dark,
-                prior_pivot_px=0.02 * radius, cover=glare,
+            search = PointerSearch(
+                pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
+                fine_m=(0.35 * radius, 0.78 * radius), width_rad=float(np.deg2rad(50.0)), quantile=0.4, dark=dark,
+                pivot_sigma_px=0.02 * radius,
             )  # fmt: skip
+            fit = find_pointer(patch, search, cover=glare)
             if fit is None or fit.contrast < least:
                 continue
             if _reaches_hub(patch, fit.angle_rad, radius) >= LEAST_CONNECTED:
@@ -203,9 +204,9 @@ def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
     turn = np.linspace(-np.pi, np.pi, 180)
     outer = np.linspace(NUMERALS_FROM, TIP_AT, 12) * radius
     inner = np.linspace(0.15, NUMERALS_FROM, 12) * radius
-    face = np.median(unroll(patch, (0.0, 0.0), outer, turn, None), axis=1)
+    face = np.median(unroll(patch, (0.0, 0.0), outer, turn), axis=1)
     beside = angle_rad + np.deg2rad(np.array([-2.0, 0.0, 2.0]))
-    pointer = unroll(patch, (0.0, 0.0), outer, beside, None).mean(axis=1)
+    pointer = unroll(patch, (0.0, 0.0), outer, beside).mean(axis=1)
     contrast = float(np.median(pointer - face))
     if contrast == 0:
         return 0.0

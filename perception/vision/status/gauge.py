@@ -8,7 +8,7 @@ from hal.panel import Gauge, Scale
 from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading, doubted, gated, probability, refused
 from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
-from perception.vision.status.pointer import PointerFit, find_pointer, wrapped
+from perception.vision.status.pointer import PointerFit, PointerSearch, find_pointer, wrapped
 from perception.vision.status.reader import Reader
 
 # Share of the radius over which every gauge pointer has ink and there are no numerals
@@ -31,15 +31,15 @@ def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
     """Return the value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
     R = spec.radius_m
     seen = _seen(patch, R)
-    fit = find_pointer(
-        patch,
-        cover=lying_across(patch, half_width_m=R, half_height_m=R, is_round=True, most=MOST_COVERED),
+    search = PointerSearch(
         pivot_m=(0.0, 0.0),
         inner_m=POINTER_FROM * R,
         outer_m=POINTER_TO * R,
         fine_m=(POINTER_FROM * R, FINE_TO * R),
         from_hub=True,
     )
+    cover = lying_across(patch, half_width_m=R, half_height_m=R, is_round=True, most=MOST_COVERED)
+    fit = find_pointer(patch, search, cover=cover)
     if fit is None:
         return no_pointer(seen, spec.scale.unit)
     return status_of_pointer(fit, spec.scale, seen)

@@ -41,8 +41,8 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> PatchReading:
     """
     R, n = spec.radius_m + spec.rim_m, spec.spokes
     angles = 2 * np.pi * np.arange(STEPS) / STEPS
-    spoke = unroll(patch, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles, None)
-    mark = unroll(patch, (0.0, 0.0), np.linspace(0.45, 0.97, 12) * R, angles, None)
+    spoke = unroll(patch, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles)
+    mark = unroll(patch, (0.0, 0.0), np.linspace(0.45, 0.97, 12) * R, angles)
     seen = patch.seen(
         np.outer([0.5, 0.7, 0.9], np.sin(angles[::20])) * R, np.outer([0.5, 0.7, 0.9], np.cos(angles[::20])) * R
     )
@@ -50,7 +50,7 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> PatchReading:
         return refused("the wheel cannot be seen (glare, shadow or cover): change the angle or the light", unit="rad")
     noise = contrast_noise(patch)
     glare = _glare(patch, R)
-    dazzled = unroll(glare, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles, None) > 0.2
+    dazzled = unroll(glare, (0.0, 0.0), np.linspace(0.42, 0.72, 8) * R, angles) > 0.2
     shown = np.where(dazzled & ~dazzled.all(axis=1, keepdims=True), np.nan, spoke) if dazzled.any() else spoke
     ink = np.median(np.where(dazzled, 0.0, np.abs(spoke - _gaps(shown, n))), axis=0)
     window = STEPS // 60
@@ -61,7 +61,7 @@ def read_handwheel(patch: Patch, spec: Handwheel) -> PatchReading:
     phase = _centred(ink, _peak(folded, phase_step), n) * 2 * np.pi / STEPS
     places = phase + 2 * np.pi * np.arange(n) / n
     profile = np.array([_at(mark, p) for p in places])
-    drowned = unroll(glare, (0.0, 0.0), np.linspace(0.45, 0.97, 12) * R, angles, None)
+    drowned = unroll(glare, (0.0, 0.0), np.linspace(0.45, 0.97, 12) * R, angles)
     profile = np.where(np.array([_at_most(drowned, p) for p in places]) > 0.2, np.nan, profile)
     deviation = np.array([_mark_evidence(profile, k) for k in range(n)])
     best = int(deviation.argmax())

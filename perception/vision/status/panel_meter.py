@@ -9,7 +9,7 @@ from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading
 from perception.vision.status.gauge import STOP_RAD, no_pointer, status_of_pointer
 from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
-from perception.vision.status.pointer import find_pointer
+from perception.vision.status.pointer import PointerSearch, find_pointer
 from perception.vision.status.reader import Reader
 
 # Share of the needle's length that is visible in the window, up to where the ticks begin.
@@ -24,19 +24,19 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> PatchReading:
     pivot = (0.0, -spec.pivot_below_m)
     seen = _seen(patch, spec, lo, hi)
     margin = 1.5 * STOP_RAD
-    fit = find_pointer(
-        patch,
-        cover=lying_across(
-            patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False, most=MOST_COVERED
-        ),
+    cover = lying_across(
+        patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False, most=MOST_COVERED
+    )
+    search = PointerSearch(
         pivot_m=pivot,
         inner_m=POINTER_FROM * spec.needle_m,
         outer_m=POINTER_TO * spec.needle_m,
         fine_m=(POINTER_FROM * spec.needle_m, 0.92 * spec.needle_m),
         limits_rad=(lo - margin, hi + margin),
-        width_rad=np.deg2rad(14.0),
+        width_rad=float(np.deg2rad(14.0)),
         from_hub=True,
     )
+    fit = find_pointer(patch, search, cover=cover)
     if fit is None:
         return no_pointer(seen, spec.scale.unit)
     return status_of_pointer(fit, spec.scale, seen, rival=RIVAL, sigma_rad=SIGMA_RAD)

@@ -65,64 +65,71 @@ class PointerFit:
     unknown: float
 
 
-def find_pointer(
-    patch: Patch,
-    *,
-    pivot_m: tuple[float, float],
-    inner_m: float,
-    outer_m: float,
-    fine_m: tuple[float, float],
-    limits_rad: tuple[float, float] | None = None,
-    width_rad: float = np.deg2rad(30.0),
-    plane_z_m: float | None = None,
-    quantile: float = 0.3,
-    cover: NDArray[np.bool_] | None = None,
-    dark: bool | None = None,
-    prior_pivot_px: float = PIVOT_SIGMA_PX,
-    from_hub: bool = False,
-) -> PointerFit | None:
-    """Return the pointer about `pivot_m`, or None if none stands out.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointerSearch:
+    """Where a pointer is searched, and what is known of it.
 
-    Args:
+    Attributes:
+        pivot_m: point about which it turns, in the patch's plane.
         inner_m, outer_m: radii over which every pointer has ink.
         fine_m: radii used to refine the angle, from where the pointer begins to where it ends.
         limits_rad: smallest and largest angle, or None for a full turn.
         width_rad: anything wider is not a pointer.
-        plane_z_m: height of the pointer; None: that of the patch's plane.
         quantile: of the ink over the radii that is the score of a direction.
-        cover: (H, W) mask of the occluders of the face, or None.
         dark: polarity, if it is known.
-        prior_pivot_px: standard deviation of the pivot's position, image px.
+        pivot_sigma_px: standard deviation of the pivot's position, image px.
         from_hub: whether the inner radii are next to the hub, where the pointer has ink and numerals have none.
     """
-    angles = _angles(patch, outer_m, limits_rad)
-    radii = np.arange(min(inner_m, fine_m[0]), max(outer_m, fine_m[1]), 1.0 / patch.px_per_m)
-    polar = unroll(patch, pivot_m, radii, angles, plane_z_m)
-    hidden = _hidden(patch, cover, pivot_m, radii, angles)
+
+    pivot_m: tuple[float, float]
+    inner_m: float
+    outer_m: float
+    fine_m: tuple[float, float]
+    limits_rad: tuple[float, float] | None = None
+    width_rad: float = float(np.deg2rad(30.0))
+    quantile: float = 0.3
+    dark: bool | None = None
+    pivot_sigma_px: float = PIVOT_SIGMA_PX
+    from_hub: bool = False
+
+
+def find_pointer(patch: Patch, search: PointerSearch, *, cover: NDArray[np.bool_] | None = None) -> PointerFit | None:
+    """Return the clearest pointer about the pivot, or None when nothing stands out.
+
+    Args:
+        cover: (H, W) mask of what lies across the face (see `occluder_bands`), or None.
+    """
+    limits_rad, wraps = search.limits_rad, search.limits_rad is None
+    angles = _angles(patch, search.outer_m, limits_rad)
+    radii = np.arange(
+        min(search.inner_m, search.fine_m[0]), max(search.outer_m, search.fine_m[1]), 1.0 / patch.px_per_m
+    )
+    polar = unroll(patch, search.pivot_m, radii, angles)
+    hidden = _hidden(patch, cover, search.pivot_m, radii, angles)
     if hidden.any():
         shown = np.where(hidden, np.nan, polar)
         shown[hidden.all(axis=1)] = 0.0
         polar = np.where(hidden, np.nanmedian(shown, axis=1, keepdims=True), polar).astype(np.float32)
-    rows = (radii >= inner_m) & (radii <= outer_m)
+    rows = (radii >= search.inner_m) & (radii <= search.outer_m)
     if rows.sum() < 4:
         return None
     found: list[tuple[PointerFit, Float32]] = []
-    for is_dark in (True, False) if dark is None else (dark,):
-        ink = ink_along_angle(polar, width_rad / (angles[1] - angles[0]), is_dark, wraps=limits_rad is None)
+    for is_dark in (True, False) if search.dark is None else (search.dark,):
+        ink = ink_along_angle(polar, search.width_rad / (angles[1] - angles[0]), is_dark, wraps=wraps)
         fit = _rough(
-            ink[rows], hidden[rows], angles, wraps=limits_rad is None, quantile=quantile, is_dark=is_dark, from_hub=from_hub
+            ink[rows], hidden[rows], angles, wraps=wraps, quantile=search.quantile, is_dark=is_dark, from_hub=search.from_hub
         )  # fmt: skip
         if fit is not None:
             found.append((fit, ink))
     if not found:
         return None
-    if len(found) > 1 and limits_rad is None:
+    if len(found) > 1 and wraps:
         no_gap = [(fit, ink) for fit, ink in found if _off_face(fit, polar[rows], ink[rows], angles) > LEAST_OFF_FACE]
         found = no_gap or found
     fit, ink = max(found, key=lambda pointer: _clarity(pointer[0]))
-    offset = wrapped(angles - fit.angle_rad) if limits_rad is None else angles - fit.angle_rad
-    fine = (radii >= fine_m[0]) & (radii <= fine_m[1])
-    e_sigma = prior_pivot_px / patch.image_px_per_m
+    offset = wrapped(angles - fit.angle_rad) if wraps else angles - fit.angle_rad
+    fine = (radii >= search.fine_m[0]) & (radii <= search.fine_m[1])
+    e_sigma = search.pivot_sigma_px / patch.image_px_per_m
     angle, variance = pointer_axis(ink[fine], hidden[fine], radii[fine], offset, REFINE_RAD, e_sigma, patch.px_per_m)
     if np.isnan(angle):
         return replace(fit, sigma_rad=ROUGH_SIGMA_RAD)
@@ -148,13 +155,12 @@ def _clarity(fit: PointerFit) -> float:
     return fit.strength * (1 - fit.rival_ratio)
 
 
-def unroll(patch: Patch, pivot_m: tuple[float, float], radii_m: Array, angles_rad: Array, z_m: float | None) -> Float32:
+def unroll(patch: Patch, pivot_m: tuple[float, float], radii_m: Array, angles_rad: Array) -> Float32:
     """Return the gray values (radii, angles) around a pivot; angles are clockwise from straight up."""
-    u, v = patch.pixel_of(*pivot_m, z_m)
-    grown = 1.0 if z_m is None else 1.0 + patch.growth_per_m * (z_m - patch.plane_z_m)
+    u, v = patch.pixel_of(*pivot_m)
     directions = np.stack([np.sin(angles_rad), -np.cos(angles_rad)])
     gray = np.ascontiguousarray(patch.gray)
-    return polar_values(gray, (float(u), float(v)), radii_m * (patch.px_per_m * grown), directions)
+    return polar_values(gray, (float(u), float(v)), radii_m * patch.px_per_m, directions)
 
 
 def ink_along_angle(polar: Float32, width: float, is_dark: bool, *, wraps: bool) -> Float32:
@@ -179,7 +185,7 @@ def _hidden(
     lost = ~patch.inside if cover is None else cover | ~patch.inside
     if not lost.any():
         return np.zeros((len(radii_m), len(angles_rad)), bool)
-    return unroll(replace(patch, gray=lost.astype(np.uint8)), pivot_m, radii_m, angles_rad, None) > 0.2
+    return unroll(replace(patch, gray=lost.astype(np.uint8)), pivot_m, radii_m, angles_rad) > 0.2
 
 
 def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: float) -> Array:

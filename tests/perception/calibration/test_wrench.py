@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hal.calibration import ToolLoad
 from hal.errors import InvalidRequest, NotObservable
-from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench, unload
+from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
 
 LOAD = ToolLoad(mass_kg=1.3, centre_of_mass_m=(0.01, -0.02, 0.09), bias=(4.0, -7.0, 12.0, 0.3, -0.2, 0.1))
 
@@ -41,12 +41,6 @@ def test_errors_match_the_covariance() -> None:
         found = calibrate_wrench(R, noisy)
         scaled.append((found.load.mass_kg - 1.3) ** 2 / found.covariance[3, 3])
     assert 0.5 < np.mean(scaled) < 1.9
-
-
-def test_without_load_and_bias_nothing_remains() -> None:
-    R = poses(1, 9)[0]
-    touch = np.array([1.0, 2.0, -3.0, 0.1, 0.0, 0.2])
-    np.testing.assert_allclose(unload(reading(R) + touch, R, LOAD), touch, atol=1e-12)
 
 
 def test_one_direction_of_gravity_is_refused_and_the_next_is_named() -> None:

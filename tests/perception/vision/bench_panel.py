@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from benchmarks.vision_drawing import Disturbance, Shown, camera, draw_panel, looking_at
+from benchmarks.vision_disturbance import Disturbance
+from benchmarks.vision_drawing import Shown, camera, draw_panel, looking_at
 from hal.calibration import CameraIntrinsics
 from hal.geometry import UncertainPose, perturbed
 from hal.panel import Panel

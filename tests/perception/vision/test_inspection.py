@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.vision_drawing import Disturbance, Shown
+from benchmarks.vision_disturbance import Disturbance
+from benchmarks.vision_drawing import Shown
 from hal.calibration import CameraIntrinsics
 from hal.errors import InvalidRequest, NotFound, NotObservable
 from hal.geometry import UncertainPose

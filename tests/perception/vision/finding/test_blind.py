@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from benchmarks.vision_drawing import Disturbance
+from benchmarks.vision_disturbance import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
-from perception.vision.finding.blind import chosen, lay_out, recognise, uprightness
-from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray, region_shape
-from perception.vision.finding.match import distances, distances_reference, nearest, prepared
+from perception.vision.finding.blind import chosen, recognise
+from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray
+from perception.vision.finding.match import CLIP, NEXT_FURTHER, distances, nearest, prepared
 from perception.vision.finding.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.finding.shapes import find_edges
 from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, spread_of
 from perception.vision.knowledge_files import load_knowledge, write_kind
 from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.projection import CameraProjection, PlateProjection
-from perception.vision.teaching.lesson import check, example_at, overview_of, plate_points, teach, teach_example
+from perception.vision.teaching.lesson import check, plate_points, teach
 from tests.perception.vision.bench_panel import panel, scene
 
 PLATE = (0.60, 0.40)
@@ -185,99 +184,6 @@ def test_a_look_written_without_directions_is_the_same_all_around(tmp_path: Path
     assert np.allclose(around, (2 * np.arange(RINGS) + 0.5) / 100)
 
 
-def _with_noisy_look(knowledge: Knowledge, name: str, look: np.ndarray) -> Knowledge:
-    return knowledge.grown(TaughtKind(name=name, size_m=(0.05, 0.05), looks=look[None], noisy=np.array([True])))
-
-
-def test_looks_of_noisy_images_survive_their_files_and_say_nothing_of_the_spread(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    kinds = (TaughtKind(name="a", size_m=(0.05, 0.04), looks=np.round(rng.normal(0, 1, (3, LENGTH)), 2)),)
-    knowledge = _with_noisy_look(Knowledge(kinds=kinds, spread=spread_of(kinds)), "a", np.full(LENGTH, 9.0))
-    write_kind(knowledge.kinds[0], tmp_path)
-    loaded = load_knowledge(tmp_path)
-    (good,), (noisy,) = loaded.for_image(noisy=False).kinds, loaded.for_image(noisy=True).kinds
-    assert good.noisy is None and np.allclose(good.looks, kinds[0].looks)
-    assert noisy.noisy is not None and noisy.noisy.tolist() == [False, False, False, True]
-    assert np.allclose(loaded.spread, knowledge.spread)
-    assert loaded.for_image(noisy=False) is loaded.for_image(noisy=False), "prepared once"
-
-
-def test_a_kind_of_noisy_images_only_is_no_kind_elsewhere() -> None:
-    known = Knowledge(
-        kinds=(TaughtKind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH)
-    )
-    grown = _with_noisy_look(known, "ghost", np.ones(LENGTH))
-    assert [kind.name for kind in grown.for_image(noisy=False).kinds] == ["a"]
-    assert [kind.name for kind in grown.for_image(noisy=True).kinds] == ["a", "ghost"]
-
-
-@pytest.mark.parametrize(("sigma", "noisy"), [(0.5, False), (4.0, True)])
-def test_only_a_noisy_image_is_compared_with_looks_of_noisy_images(sigma: float, noisy: bool) -> None:
-    image, view = overview(disturbance=Disturbance(noise_sigma=sigma))
-    ground = lay_out(image, view, PLATE)
-    at = (np.array(panel().object("mode").point_m[:2]) * [1.0, -1.0] + np.array(PLATE) / 2) * PLATE_PX_PER_M
-    look = look_at(ground, at)
-    knowledge = _with_noisy_look(load_knowledge(), "ghost", look[0])
-    found = chosen(ground, at[None], look, knowledge, view, PLATE)
-    assert ground.noisy is noisy
-    assert any(candidate.kind == "ghost" for candidate in found) is noisy
-
-
-@pytest.mark.parametrize(("noisy", "named"), [(False, "chance"), (True, "often")])
-def test_one_look_that_is_near_by_chance_names_nothing_in_a_noisy_image(noisy: bool, named: str) -> None:
-    picture = np.full((300, 400), 150, np.uint8)
-    cv2.circle(picture, (200, 150), 30, 60, -1)
-    edges, level = find_edges(picture), plate_gray(picture)
-    ground = Ground(picture=picture.astype(np.float32), edges=edges, plate_gray=level, noisy=noisy)
-    place = np.array([[200.0, 150.0]])
-    look = look_at(ground, place)
-    off = {"chance": (0.0, 0.6, 0.6), "often": (0.1, 0.1, 0.1)}
-    kinds = tuple(TaughtKind(name=n, size_m=(0.04, 0.04), looks=look + np.array(by)[:, None]) for n, by in off.items())
-    view = PlateProjection(px_from_plate=np.diag([PLATE_PX_PER_M, -PLATE_PX_PER_M, 1.0]), corners_m=np.zeros((4, 2)))
-    plate_m = (400 / PLATE_PX_PER_M, 300 / PLATE_PX_PER_M)
-    (found,) = chosen(ground, place, look, Knowledge(kinds=kinds, spread=np.ones(LENGTH)), view, plate_m)
-    assert (found.kind, found.reason) == (named, None)
-
-
-def test_noise_says_nothing_of_which_way_is_up() -> None:
-    image, view = overview()
-    ground, knowledge = lay_out(image, view, PLATE), load_knowledge()
-    at = (
-        np.array([panel_object.point_m[:2] for panel_object in panel().objects]) * [1.0, -1.0] + np.array(PLATE) / 2
-    ) * PLATE_PX_PER_M
-    found = chosen(ground, at, look_at(ground, at), knowledge, view, PLATE)
-    up = uprightness(ground, found, knowledge, PLATE)
-    noisy = replace(ground, noisy=True)
-    ghosts = [replace(candidate, kind="ghost") for candidate in found]
-    with_ghost = _with_noisy_look(knowledge, "ghost", np.zeros(LENGTH))
-    assert up > 0.0
-    assert uprightness(noisy, found, knowledge, PLATE) == up
-    assert uprightness(noisy, ghosts, with_ghost, PLATE) == 0.0
-
-
-def test_what_lies_far_from_a_middle_counts_in_good_images_only() -> None:
-    known = Knowledge(
-        kinds=(TaughtKind(name="a", size_m=(0.05, 0.04), looks=np.zeros((1, LENGTH))),), spread=np.ones(LENGTH)
-    )
-    rows = np.zeros((2, len(GROUPS), len(RADII_M)))
-    rows[0, :, RADII_M > 0.036] = rows[1, :, RADII_M < 0.03] = 1.0
-    looks = np.zeros((2, LENGTH))
-    looks[:, : rows[0].size] = rows.reshape(2, -1)
-    far, near = distances(looks, known.for_image(noisy=True))[:, 0]
-    assert far == 0.0 < near
-    assert (distances(looks, known.for_image(noisy=False)) > 0.0).all()
-
-
-def test_looks_of_noisy_images_refuse_no_lesson_of_a_good_one() -> None:
-    image, view = overview()
-    example = example_at(overview_of(image, plate_m=PLATE), [pixel_of(view, "emergency")])
-    others = load_knowledge()
-    twice = _with_noisy_look(_with_noisy_look(others, "ghost", example.look), "ghost", example.look + 1.0)
-    assert not example.noisy
-    assert teach_example(example, twice, kind="mushroom").added
-    assert teach_example(example, _with_noisy_look(others, "mushroom", example.look), kind="mushroom").added
-
-
 def test_a_disc_looks_the_same_from_all_directions_and_a_bar_does_not() -> None:
     looks = {}
     for name in ("disc", "bar"):
@@ -311,6 +217,17 @@ def test_what_is_as_much_like_one_kind_as_another_is_refused_by_name() -> None:
     assert doubtful.reason is not None and "a b" in doubtful.reason and doubtful.rival[0] == "b"
 
 
+def distances_reference(looks: np.ndarray, knowledge: Knowledge, *, mean_of: int = 1) -> np.ndarray:
+    """Compute `distances`, or `nearest` with `mean_of`, in plain numpy."""
+    columns = []
+    for kind in knowledge.kinds:
+        difference = np.abs(looks[:, None] - kind.looks[None]) / knowledge.spread
+        near = np.sort(np.average(np.minimum(difference, CLIP), axis=2, weights=knowledge.weights), axis=1)[:, :mean_of]
+        lacking = np.arange(1, mean_of - near.shape[1] + 1)
+        columns.append(np.hstack([near, near[:, -1:] + NEXT_FURTHER * lacking]).mean(axis=1))
+    return np.column_stack(columns)
+
+
 def test_the_fast_match_agrees_with_the_plain_one() -> None:
     rng = np.random.default_rng(1)
     kinds = tuple(
@@ -324,20 +241,6 @@ def test_the_fast_match_agrees_with_the_plain_one() -> None:
         for mean_of in (3, 6):  # one kind has only four looks
             plain = distances_reference(looks, known, mean_of=mean_of)
             assert np.allclose(nearest(looks, prepared(known), mean_of=mean_of), plain)
-
-
-def test_shape_features_do_not_change_with_turn_and_size() -> None:
-    v, u = np.mgrid[:200, :200]
-    small = (np.abs(u - 100) < 30) & (np.abs(v - 100) < 15)
-    c, s = np.cos(0.6), np.sin(0.6)
-    x, y = c * (u - 100) + s * (v - 100), -s * (u - 100) + c * (v - 100)
-    turned = (np.abs(x) < 60) & (np.abs(y) < 30)
-    disc = np.hypot(u - 100, v - 100) < 40
-    a, b, d = region_shape(small), region_shape(turned), region_shape(disc)
-    assert a is not None and b is not None and d is not None
-    assert a.aspect == pytest.approx(b.aspect, rel=0.06) and d.aspect == pytest.approx(1.0, abs=0.03)
-    assert np.allclose(a.descriptors, b.descriptors, atol=0.04)
-    assert max(d.descriptors) < 0.02 < max(a.descriptors)
 
 
 def test_looks_of_a_turned_picture_are_the_turned_looks() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from perception.vision.patch import Patch
-from perception.vision.status.pointer import find_pointer
+from perception.vision.status.pointer import PointerSearch, find_pointer
 
 SIZE, RADIUS_M, PX_PER_M = 240, 0.045, 2200.0
 
@@ -40,10 +40,8 @@ def face(angle_rad: float, seed: int) -> Patch:
 def test_a_bright_numeral_beside_a_dim_pointer_does_not_turn_it(angle_deg: float) -> None:
     R = RADIUS_M
     for seed in range(3):
-        fit = find_pointer(
-            face(float(np.deg2rad(angle_deg)), seed), pivot_m=(0.0, 0.0), inner_m=0.25 * R, outer_m=0.6 * R,
-            fine_m=(0.25 * R, 0.72 * R),
-        )  # fmt: skip
+        search = PointerSearch(pivot_m=(0.0, 0.0), inner_m=0.25 * R, outer_m=0.6 * R, fine_m=(0.25 * R, 0.72 * R))
+        fit = find_pointer(face(float(np.deg2rad(angle_deg)), seed), search)
         assert fit is not None and not fit.is_dark
         assert np.rad2deg(fit.angle_rad) == pytest.approx(angle_deg, abs=1.2)
 
@@ -57,9 +55,9 @@ def test_bright_numerals_that_do_not_reach_the_hub_are_no_pointer(angle_deg: flo
     towards = np.array([np.sin(numerals), -np.cos(numerals)]) * R * PX_PER_M
     ends = [np.round(16 * (middle + share * towards)).astype(int).tolist() for share in (0.36, 0.62)]
     picture = cv2.line(patch.gray.copy(), *ends, 220, 7, cv2.LINE_AA, 4)
-    fit = find_pointer(
-        replace(patch, gray=cv2.GaussianBlur(picture, (0, 0), 1.0)), pivot_m=(0.0, 0.0), inner_m=0.25 * R, outer_m=0.6 * R,
-        fine_m=(0.25 * R, 0.48 * R), from_hub=True,
-    )  # fmt: skip
+    search = PointerSearch(
+        pivot_m=(0.0, 0.0), inner_m=0.25 * R, outer_m=0.6 * R, fine_m=(0.25 * R, 0.48 * R), from_hub=True
+    )
+    fit = find_pointer(replace(patch, gray=cv2.GaussianBlur(picture, (0, 0), 1.0)), search)
     assert fit is not None
     assert np.rad2deg(fit.angle_rad) == pytest.approx(angle_deg, abs=3.0)

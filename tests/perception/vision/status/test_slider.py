@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from benchmarks.vision_drawing import Disturbance, camera, draw_panel, looking_at
+from benchmarks.vision_disturbance import Disturbance
+from benchmarks.vision_drawing import camera, draw_panel, looking_at
 from hal.arrays import Array
 from hal.geometry import certain
 from hal.panel import Light, Panel, Scale, Slider

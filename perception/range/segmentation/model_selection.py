@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,9 @@ LOCAL_BLOCKS = 45  # in such a part
 LOCAL_TRIES = 5  # number of such parts
 FEW_BLOCKS_FOR_QUADRIC = 60  # a quadric is not fitted to smaller components
 GIVE_UP = 14.0  # mean square of a rough fit above which a kind is dropped; one that can succeed has 8 at most
+
+Fit = Callable[[Indices], tuple[int, Array, float]]
+"""A function of the flat indices of blocks that returns the best kind, its parameters and the share explained."""
 
 
 @dataclass(slots=True, eq=False)
@@ -63,7 +67,7 @@ def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, 
     turn_limit = float(np.cos(max(0.7, 5.0 * grid.normal_sigma_rad)))
     cos_limit = float(np.cos(max(0.5, 4.0 * grid.normal_sigma_rad)))
     flat_free, flat_blocks = free.ravel(), blocks.ravel()
-    attempts, left = 0, np.flatnonzero(flat_free)
+    fit_of, attempts, left = _fit_of(grid), 0, np.flatnonzero(flat_free)
     for _ in range(ROUNDS):
         starts, indices = smooth_components(
             left, grid.z, grid.sigma, free, slope * grid.size_px, 1.0 / focal_px, grid.perspective, grid.normal, grid.rms,
@@ -76,7 +80,7 @@ def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, 
         for k in range(count):
             members = indices[starts[k] : starts[k + 1]]
             members = members[flat_free[members]]
-            best = _best_model(grid, cos_limit, free, members, least) if len(members) >= least else None
+            best = _best_model(grid, fit_of, cos_limit, free, members, least) if len(members) >= least else None
             if best is None:
                 # Blocks that no surface explains now are not tried again, because later rounds would fail as well.
                 flat_free[members] = False
@@ -88,13 +92,13 @@ def select_models(grid: Grid, blocks: Labels, *, found: Candidates, least: int, 
 
 
 def _best_model(
-    grid: Grid, cos_limit: float, free: Flags, members: Indices, least: int
+    grid: Grid, fit_of: Fit, cos_limit: float, free: Flags, members: Indices, least: int
 ) -> tuple[int, Array, Indices] | None:
     """Return kind, parameters and blocks (flat indices) of the surface that explains most of `members`; None if none does."""
-    kind, th, share = _fitted(grid, members)
+    kind, th, share = fit_of(members)
     fits = [(kind, th)]
     if kind < 0 or share < WHOLE_SHARE:
-        fits += [_fitted(grid, part)[:2] for part in _parts(grid, members)]
+        fits += [fit_of(part)[:2] for part in _parts(grid, members)]
     queue, mark = np.empty(grid.z.size, np.int64), np.zeros(grid.z.size, np.uint8)
     best, best_gain, mine = -1, 0.0, queue[:0]
     for k, (kind, th) in enumerate(fits):
@@ -110,7 +114,7 @@ def _best_model(
     if best < 0:
         return None
     if best > 0 or len(mine) < 0.9 * len(members):
-        kind, th, _ = _fitted(grid, mine)
+        kind, th, _ = fit_of(mine)
         if kind >= 0:
             return kind, th, mine
     return *fits[best], mine
@@ -122,17 +126,17 @@ def _parts(grid: Grid, members: Indices) -> Iterator[Indices]:
     width = grid.z.shape[1]
     if len(inside) < LOCAL_TRIES + 2:
         return
+    rows, columns = np.divmod(members, width)
     for t in range(LOCAL_TRIES):
-        seed = inside[((t + 1) * (len(inside) - 1)) // (LOCAL_TRIES + 1)]
-        rows, columns = members // width - seed // width, members % width - seed % width
-        yield members[rows * rows + columns * columns <= LOCAL_BLOCKS / np.pi]
+        row, column = divmod(int(inside[((t + 1) * (len(inside) - 1)) // (LOCAL_TRIES + 1)]), width)
+        yield members[(rows - row) ** 2 + (columns - column) ** 2 <= LOCAL_BLOCKS / np.pi]
 
 
-def _fitted(grid: Grid, members: Indices) -> tuple[int, Array, float]:
-    """Call `_fit_blocks` for the blocks `members` (flat indices) of a grid."""
+def _fit_of(grid: Grid) -> Fit:
+    """Return `_fit_blocks` for the blocks of a grid, as a function of their flat indices."""
     x, y, z, sigma = (a.ravel() for a in (grid.x, grid.y, grid.z, grid.sigma))
     normal = grid.normal.reshape(-1, 3)
-    return _fit_blocks(x, y, z, sigma, normal, grid.perspective, grid.size_px**2, grid.slow_share, members)
+    return partial(_fit_blocks, x, y, z, sigma, normal, grid.perspective, grid.size_px**2, grid.slow_share)
 
 
 @compiled

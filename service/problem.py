@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 from hal import errors as hal_errors
 from hal.errors import CellError
@@ -32,12 +32,24 @@ STATUS: dict[type[CellError], HTTPStatus] = {
 }
 
 
+class ProblemFields(TypedDict):
+    """A problem as tasks and reports keep it; reports of defects have no `type`, `status` and `details`."""
+
+    type: NotRequired[str]
+    title: str
+    status: NotRequired[int]
+    detail: str
+    hint: str
+    retry: str
+    details: NotRequired[dict[str, Any]]
+
+
 def status_of(error: CellError) -> int:
     """Return the HTTP status for an error."""
     return int(next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS))
 
 
-def problem_of(error: CellError) -> dict[str, Any]:
+def problem_of(error: CellError) -> ProblemFields:
     """Return `type`, `title`, `status`, `detail`, `hint`, `retry` and `details` of an error as plain JSON values."""
     return {
         "type": f"urn:panelwright:{error.type_name}",

@@ -65,7 +65,7 @@ class TaskView(BaseModel):
             step=task.step,
             request=task.request,
             result=task.result if state.is_final else None,
-            problem=task.problem if state.is_final else None,
+            problem={**task.problem} if state.is_final and task.problem else None,
             artefacts=[
                 ArtefactView(
                     name=item.name,

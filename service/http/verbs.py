@@ -78,5 +78,6 @@ def answer(task: Task) -> Response:
         return JSONResponse(TaskView.of(task).model_dump(mode="json"), 200, headers=location)
     if not task.state.is_final:
         return JSONResponse(TaskView.of(task).model_dump(mode="json"), 202, headers={**location, "Retry-After": "1"})
-    problem = task.problem or {"type": "urn:panelwright:cancelled", "title": "Cancelled", "status": 409}
+    cancelled = {"type": "urn:panelwright:cancelled", "title": "Cancelled", "status": 409}
+    problem: dict[str, Any] = {**task.problem} if task.problem else cancelled
     return JSONResponse({**problem, "instance": location["Location"]}, problem["status"], location, media_type=MEDIA)

@@ -10,6 +10,7 @@ from typing import Any
 
 from hal.errors import CellError
 from hal.motion import MotionReport
+from service.problem import ProblemFields
 from service.schema.fuse_results import FuseResult
 from service.schema.mission_results import ActionResult, ObjectDepth, ObjectPlace, ReadingResult, SurfaceCheck
 from service.schema.results import EstimatedPose, FittedPlate
@@ -71,7 +72,7 @@ class MissionRecord:
     by_surfaces: list[SurfaceCheck] | None = None
     depths: list[ObjectDepth] | None = None
     not_parked: str | None = None
-    problem: dict[str, Any] | None = None
+    problem: ProblemFields | None = None
     started_cell_s: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from service.problem import ProblemFields
+
 MAX_EVENTS = 2000  # a task that reports more than this drops its oldest events; their sequence numbers show the gap
 
 
@@ -88,7 +90,7 @@ class Task:
     key: str | None = None
     state: TaskState = TaskState.QUEUED
     result: Any = None
-    problem: dict[str, Any] | None = None
+    problem: ProblemFields | None = None
     artefacts: list[Artefact] = field(default_factory=list)
     events: list[TaskEvent] = field(default_factory=list)
     created_s: float = field(default_factory=time.time)

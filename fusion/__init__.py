@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fusion.shapes import Box, Cylinder, FeatureSet, MovingPart, Shape
     from fusion.shared_errors import FusedObservations, error_budget, fuse_observations
     from fusion.solve import solve_from_many
-    from fusion.triangulation import PanelDepth, TriangulatedPoint, depth_before, triangulate, with_common_errors
+    from fusion.triangulation import depth_before, triangulate, with_common_errors
     from fusion.warm import warm_up
 
 __all__ = [
@@ -44,7 +44,6 @@ __all__ = [
     "Measurement",
     "MovingPart",
     "Observation",
-    "PanelDepth",
     "PixelObservation",
     "PlaneObservation",
     "PoseTolerance",
@@ -55,7 +54,6 @@ __all__ = [
     "ShapeEstimate",
     "TouchObservation",
     "TouchPlan",
-    "TriangulatedPoint",
     "depth_before",
     "error_budget",
     "fuse",

@@ -28,18 +28,29 @@ def load_modules() -> None:
     """
     for name in ("service.operations.mission", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         import_module(name)
-    for stage in OF_SERVICE:
-        _warm_up_of(stage)
+    _warm_ups()
 
 
-def _warm_up_of(stage: str) -> Callable[[], None]:
-    """Return the `warm_up` of a stage's face, whose modules are imported with it."""
-    warm_up: Callable[[], None] = import_module(OF_SERVICE[stage]).warm_up
-    return warm_up
+def _warm_ups() -> dict[str, Callable[[], None]]:
+    """Return each stage of the service process with its function, whose modules are imported with it, the longest first.
+
+    The cell and world processes load their own kernels when they start.
+    """
+    import fusion
+    import manipulation
+    import perception.range
+    import perception.vision
+
+    return {
+        "range": perception.range.warm_up,
+        "vision": perception.vision.warm_up,
+        "fusion": fusion.warm_up,
+        "planning": manipulation.warm_up,
+    }
 
 
 def _warm_up(stage: str) -> None:
-    _warm_up_of(stage)()
+    _warm_ups()[stage]()
 
 
 def _cell() -> None:
@@ -54,13 +65,7 @@ def _cell() -> None:
         supervisor.close()
 
 
-OF_SERVICE = {
-    "range": "perception.range",
-    "vision": "perception.vision",
-    "fusion": "fusion",
-    "planning": "manipulation",
-}
-"""The stages of the service process and their faces. The cell and world processes load their own kernels when they start."""
+OF_SERVICE = ("range", "vision", "fusion", "planning")
 STAGES: Mapping[str, Callable[[], None]] = {
     **{stage: partial(_warm_up, stage) for stage in OF_SERVICE},
     "cell": _cell,

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from perception.range.analysis import RangeScene, analyse
     from perception.range.batch import batch_range, recordings_in
     from perception.range.batch_results import BatchResult, KeptResults
-    from perception.range.matching.cross_check import PlaceCheck, check_place, outline_px, states_agree
+    from perception.range.matching.cross_check import check_place, outline_px, states_agree
     from perception.range.matching.match import Match, match_models
     from perception.range.matching.models import load_models, shipped_models
     from perception.range.matching.panel_objects import PanelScan, Sighting, find_objects
@@ -33,7 +33,6 @@ __all__ = [
     "OrthographicSensor",
     "PanelScan",
     "PinholeSensor",
-    "PlaceCheck",
     "Plane",
     "PlaneFit",
     "RangeScene",

@@ -6,9 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.vision import lights, quadrangle
+from perception.vision.bilinear import step_counts
+from perception.vision.finding.cables import without_cables
+from perception.vision.finding.components import components
+from perception.vision.finding.match import nearest, prepared
+from perception.vision.finding.segment import grow_regions
+from perception.vision.knowledge_files import load_knowledge
+from perception.vision.look import LENGTH
 from perception.vision.photographs.dial import read_dial
 from perception.vision.photographs.photo_display import read_photographed_display
+from perception.vision.registration.edge_search import strongest_edges
 from perception.vision.status.display import read_window
+from perception.vision.status.occluders import ring_medians
 
 DIGIT_PX = (72, 40)  # height and width
 STROKE_PX = 8
@@ -16,7 +25,7 @@ DIAL_PX = 110  # half side of the picture
 
 
 def warm_up() -> None:
-    """Run the light search, the pose of four lights, and the display and pointer readers once."""
+    """Run the light search, the pose of four lights, the readers of displays and pointers, and the search for objects once."""
     quadrangle.warm_up()
     lights.warm_up()
     window = three_eights()
@@ -25,6 +34,22 @@ def warm_up() -> None:
     read_window(window, digits=3, decimals=1, dark=True, hidden=hidden)
     read_photographed_display(window, scene=True)
     read_dial(upright_pointer(), minimum=0.0, maximum=1.0, circular=True)
+    _find_objects(window)
+
+
+def _find_objects(picture: NDArray[np.uint8]) -> None:
+    """Run the loops that find objects and what lies across them once, on a gray picture."""
+    known = prepared(load_knowledge())
+    nearest(np.zeros((1, LENGTH)), known, mean_of=1)
+    grow_regions(picture)
+    components((picture < 100).astype(np.uint8), diagonal=True)
+    banded = np.full((320, 480), 200, np.uint8)
+    banded[:, 236:244] = 20  # a cable from top to bottom
+    without_cables(banded, np.full(banded.shape, 200.0, np.float32))
+    middle = np.array([[40.0, 40.0]])
+    strongest_edges(picture.astype(np.float32), middle, np.array([[1.0, 0.0]]), 4.0)
+    ring_medians(picture[40].copy(), 9)
+    step_counts(picture, 4)
 
 
 def upright_pointer() -> NDArray[np.uint8]:

@@ -4,7 +4,8 @@ Residuals are whitened by their covariance, so that the sum is a chi-square and 
 
 `descend` minimises any residuals. The loops that run thousands of times per second are compiled together with their
 residuals: those of `fusion.solve.descent`, `perception.vision.quadrangle` and `perception.range.fitting`. They differ in
-how they linearise and move, and share the step, `solve_damped`, and the rule that follows it, `next_damping`.
+how they linearise and move, and share the rule of the damping, `next_damping`; the first two also share the step,
+`solve_damped`.
 
 Source: D. W. Marquardt, J. SIAM 11(2), 1963: the damping is scaled by the diagonal of J^T J, falls after a step that
 reduces the sum, and rises after one that does not.

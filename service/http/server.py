@@ -62,10 +62,11 @@ class HttpServer:
 
     def start(self) -> None:
         """Serve in a thread of its own."""
-        self._thread = threading.Thread(target=self.run, name="http", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self.run, name="http", daemon=True)
+        thread.start()
+        self._thread = thread  # only now, because another thread may call `stop`, which joins it
         pause = threading.Event()
-        while not self._server.started and self._thread.is_alive():
+        while not self._server.started and thread.is_alive():
             pause.wait(0.01)
 
     def stop(self) -> None:

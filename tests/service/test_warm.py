@@ -13,11 +13,12 @@ from service.warm import STAGES
 
 IMPORTED = """
 import sys
-from service.warm import ROOMS, load_modules, warm
+from service.warm import load_modules, sources, warm
 load_modules()
 before = set(sys.modules)
 warm()
-print([name for name in sorted(set(sys.modules) - before) if name.split(".")[0] in ROOMS])
+kernels = {str(path) for path in sources()}
+print([name for name in sorted(set(sys.modules) - before) if getattr(sys.modules[name], "__file__", None) in kernels])
 """
 
 

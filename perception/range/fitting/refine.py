@@ -9,8 +9,8 @@ import numpy as np
 
 from hal.arrays import Array, Mask
 from hal.jit import compiled
-from hal.least_squares import DampingRule, next_damping, solve_damped
-from hal.small_algebra import LEAST_PIVOT
+from hal.least_squares import DampingRule, next_damping
+from hal.small_algebra import solve_positive
 from perception.range.fitting.equations import normal_equations
 from perception.range.fitting.rays import ERRED, LOADED, SCRATCH
 from perception.range.fitting.surfaces import (
@@ -106,11 +106,13 @@ def refine(
 def free_step(H: Array, g: Array, fixed: Mask, damping: float, p: int, A: Array, step: Array) -> bool:
     """Write the damped step of the free parameters into `step` (p,), zero for the `fixed` ones; `A` (p, p) is overwritten.
 
-    `H` and `g` are the Gauss-Newton matrix and gradient. Returns False if the matrix is not positive definite.
+    `H` and `g` are the Gauss-Newton matrix and gradient. Returns False if the matrix is not positive definite. The damping
+    multiplies the diagonal, because another order of rounding (`solve_damped` adds it) changes which surfaces of real
+    images are merged.
     """
     for a in range(p):
         for b in range(a + 1):
             A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
-        A[a, a] = 1.0 if fixed[a] else A[a, a]
+        A[a, a] = 1.0 if fixed[a] else A[a, a] * (1.0 + damping) + FLOOR
         step[a] = 0.0 if fixed[a] else g[a]
-    return solve_damped(A, A, damping, FLOOR, LEAST_PIVOT, step, A, p) >= 0.0
+    return solve_positive(A, step, p)

@@ -48,14 +48,14 @@ demo: setup  ## Run the whole mission on the simulated cell and leave a report i
 serve: setup  ## Start the service on http://127.0.0.1:8460
 	@$(BIN)/panelwright serve
 
-test: setup  ## Run all tests, three files at a time; PYTEST_OPTIONS go to pytest
-	@$(BIN)/python -m pytest --numprocesses 3 --dist loadscope --no-loadscope-reorder $(PYTEST_OPTIONS)
+test: setup  ## Run all tests, four files at a time; PYTEST_OPTIONS go to pytest
+	@$(BIN)/python -m pytest --numprocesses 4 --dist loadscope --no-loadscope-reorder $(PYTEST_OPTIONS)
 
 test-wire: setup  ## Run only the missions over emulated wires
 	@$(BIN)/python -m pytest -m wire
 
 test-fast: setup  ## Run the tests without missions, browsers and scaffolds
-	@$(BIN)/python -m pytest --numprocesses 3 --dist loadscope --no-loadscope-reorder -m 'not slow and not wire'
+	@$(BIN)/python -m pytest --numprocesses 4 --dist loadscope --no-loadscope-reorder -m 'not slow and not wire'
 
 lint: setup  ## Style, types and layering, side by side
 	@$(MAKE) --no-print-directory -j 3 --output-sync=target lint-style lint-types lint-layers

@@ -18,7 +18,7 @@ from drivers.transport.device import WireDevice
 from drivers.transport.serial_link import SYSFS, latency_timer_ms, port_owner, serial_ports
 from hal.clock import Deadline, WallClock
 from hal.config import Cell
-from hal.errors import CellError, ConfigError, DeviceUnavailable
+from hal.errors import CellError, DeviceUnavailable
 from hal.registry import Context, connect
 
 BAUDS = (
@@ -110,8 +110,6 @@ def examine_device(
         with closing(opened(name, driver, options)) as device:
             yield WireFinding(name, True, measured(device))
         return
-    except ConfigError:
-        raise
     except CellError as error:
         told = error
     baud = _answering_baud(name, driver, options, opened) if isinstance(told, DeviceUnavailable) else None

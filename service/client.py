@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,8 +14,23 @@ import httpx2
 from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry, detail_lines
 
 DEFAULT_URL = "http://127.0.0.1:8460"
+# Commands that address a service, without those that have their own address or their own cell or read files.
+TALKING = re.compile(
+    r"`panelwright (?!devices (?:record|replay))(?:devices|task|stop|calibrate|learn)\b"
+    r"(?![^`]*--(?:url|cell)\b)[^`]*(?=`)"
+)
 FINAL = ("succeeded", "failed", "cancelled")
+SEE_LOG = "see the log of the service"
 STOP_WAIT_S = 1.0  # after this, the stop process is asked, which other work cannot delay
+
+
+def for_service(text: str, url: str) -> str:
+    """Return a hint whose commands address the service at `url`: `--url` is added where that is not the default.
+
+    Commands stand between back quotes; one that names its service or its cell is left as it is.
+    """
+    url = url.rstrip("/")
+    return text if url == DEFAULT_URL else TALKING.sub(rf"\g<0> --url {url}", text)
 
 
 class ApiError(CellError):
@@ -23,7 +39,7 @@ class ApiError(CellError):
     def __init__(self, problem: dict[str, Any]) -> None:
         super().__init__(
             str(problem.get("detail", "the service refused")),
-            hint=str(problem.get("hint", "see the log of the service")),
+            hint=str(problem.get("hint", SEE_LOG)),
             **problem.get("details", {}),
         )
         self.problem = problem
@@ -48,10 +64,16 @@ class Client:
     Args:
         url: address of the service, e.g. `http://127.0.0.1:8460`.
         timeout_s: the longest wait for one answer.
+        is_lasting: whether the service goes on after this client, so that hints may name its address.
     """
 
     url: str = DEFAULT_URL
     timeout_s: float = 40.0
+    is_lasting: bool = True
+
+    def addressed(self, hint: str) -> str:
+        """Return a hint whose commands address this service; see `for_service`."""
+        return for_service(hint, self.url) if self.is_lasting else hint
 
     def get(self, path: str) -> Any:
         """Return the JSON answer to a GET request.
@@ -126,7 +148,8 @@ class Client:
             try:
                 with connection.stream(method, url, json=body, headers=headers) as answer:
                     if answer.status_code >= httpx2.codes.BAD_REQUEST:
-                        raise ApiError(_problem(answer.read(), answer.status_code))
+                        problem = _problem(answer.read(), answer.status_code)
+                        raise ApiError({**problem, "hint": self.addressed(str(problem.get("hint", SEE_LOG)))})
                     yield answer
             except httpx2.RequestError as error:
                 raise self._lost(error) from error
@@ -144,8 +167,14 @@ class Client:
         why = str(error).partition("] ")[2] or str(error) or type(error).__name__  # without the error number
         return DeviceUnavailable(
             f"no panelwright service answers at {self.url}: {why}",
-            hint="start one with `panelwright serve`, or name its address with --url",
+            hint=f"start one with `panelwright serve{_port_option(self.url)}`, or name its address with --url",
         )
+
+
+def _port_option(url: str) -> str:
+    """Return the option with which `serve` listens at `url`; empty for the default."""
+    port = httpx2.URL(url if "//" in url else f"http://{url}").port
+    return "" if port in (None, httpx2.URL(DEFAULT_URL).port) else f" --port {port}"
 
 
 def _json(data: bytes) -> Any:

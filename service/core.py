@@ -20,6 +20,7 @@ from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.knowledge.calibrations import Calibrations
 from service.operations import Operation, OperationContext
+from service.processes.device_slots import IN_MOTION
 from service.processes.supervisor import Supervisor
 from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
@@ -169,6 +170,19 @@ class Service:
             self.note("device-swap-failed", {**told, "why": error.what})
             raise
         self.note("device-swapped", {**told, "seconds": round(time.monotonic() - started_s, 3)})
+
+    def lacking(self) -> dict[str, tuple[str, ...]]:
+        """Return for each verb the missing devices that it may need; empty for a verb that can do all of its work."""
+        return {verb: self._lacking_for(operation) for verb, operation in self.operations.items()}
+
+    def lost_without(self, device: str) -> tuple[str, ...]:
+        """Return the verbs that may need the missing device `device`."""
+        return tuple(verb for verb, devices in self.lacking().items() if device in devices)
+
+    def _lacking_for(self, operation: Operation) -> tuple[str, ...]:
+        kinds = {*operation.needs, *(IN_MOTION if operation.moves else ())}
+        devices = self.cell.file.devices
+        return tuple(one.device for one in self.supervisor.missing if devices[one.device].kind in kinds)
 
     def close(self) -> None:
         """Stop the arm, end tasks and processes, close the journal; takes a bounded time and is idempotent."""

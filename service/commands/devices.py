@@ -206,7 +206,8 @@ def watch_devices(
     """Show values, rates, ages and error counters of all devices repeatedly."""
     from service.commissioning.watching import Watch
 
-    watch, looks = Watch(client_of(url), with_pictures=pictures), 0
+    client = client_of(url)
+    watch, looks = Watch(client, with_pictures=pictures), 0
     with Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext() as live:
         while True:
             try:
@@ -214,7 +215,7 @@ def watch_devices(
             except CellError as error:  # a service that answered before may come back
                 if looks == 0:
                     raise
-                shown = f"[red]{escape(error.what)}[/]; try: {escape(error.hint)}"
+                shown = f"[red]{escape(error.what)}[/]; try: {escape(client.addressed(error.hint))}"
             if live is None:  # without a terminal, print each table below the one before
                 console.print(shown)
             else:

@@ -9,10 +9,12 @@ import typer
 from service.commands.common import DEFAULT_CELL, CellOption, console
 from service.commands.warm import compile_first
 
+PORT = 8460
+
 
 def doctor(
     cell: CellOption = DEFAULT_CELL,
-    port: Annotated[int, typer.Option(min=0, max=65534, help="Port that `serve` would use.")] = 8460,
+    port: Annotated[int, typer.Option(min=0, max=65534, help="Port that `serve` would use.")] = PORT,
     connect: Annotated[bool, typer.Option(help="Also start the cell and time its devices.")] = True,
 ) -> None:
     """Check Python, packages, ports, the cell file and its devices; the exit code is 1 when something is wrong."""
@@ -22,4 +24,8 @@ def doctor(
         compile_first()
     if not examine(cell, port, connect=connect):
         raise typer.Exit(1)
-    console.print("everything is in order: `panelwright serve` runs it")
+    options = [
+        *(["--cell", str(cell)] if cell != DEFAULT_CELL else []),
+        *(["--port", str(port)] if port != PORT else []),
+    ]
+    console.print(f"everything is in order: `{' '.join(['panelwright serve', *options])}` runs it")

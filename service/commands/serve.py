@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.markup import escape
 
+from service.client import for_service
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console, read_cell
 from service.commands.shutdown import leave
 from service.commands.warm import compile_first
 
 if TYPE_CHECKING:
+    from service.core import Service
     from service.serve import Panelwright
 
 START_PATIENCE_S = 120.0
@@ -79,9 +82,20 @@ def check_host(host: str) -> None:
 def _announce(panelwright: Panelwright) -> None:
     panelwright.wait_until_settled(START_PATIENCE_S)
     if panelwright.error is None and not panelwright.is_ending:  # not after Ctrl-C during the start
-        console.print(f"panelwright: ready at [bold]{panelwright.url}[/]   stop: POST {panelwright.stop_url}")
-        for missing in panelwright.service.supervisor.missing:
-            console.print(f"panelwright: without [bold]{missing.device}[/]: {escape(missing.why)}")
-            console.print(f"  try    {escape(missing.hint)}; then `panelwright devices connect {missing.device}`")
-        if panelwright.service.supervisor.latch.is_set():
-            console.print("panelwright: the stop is latched; `panelwright stop --reset` when the cell is clear")
+        for line in announcement(panelwright.service, panelwright.url, panelwright.stop_url):
+            console.print(line)
+
+
+def announcement(service: Service, url: str, stop_url: str) -> Iterator[str]:
+    """Yield what `serve` prints when the cell runs: addresses, missing devices with what is lost, and a latched stop."""
+    missing = service.supervisor.missing
+    state = f"without {len(missing)} of {len(service.cell.file.devices)} devices" if missing else "ready"
+    yield f"panelwright: {state} at [bold]{url}[/]   stop: POST {stop_url}"
+    for one in missing:
+        connect = for_service(f"{one.hint}; then `panelwright devices connect {one.device}`", url)
+        yield f"panelwright: without [bold]{one.device}[/]: {escape(one.why)}"
+        yield f"  lost   {', '.join(service.lost_without(one.device)) or 'nothing but its readings'}"
+        yield f"  try    {escape(connect)}"
+    if service.supervisor.latch.is_set():
+        reset = for_service("`panelwright stop --reset`", url)
+        yield f"panelwright: the stop is latched; {reset} when the cell is clear"

@@ -40,10 +40,12 @@ def show_task(task_id: TaskId, url: Url = UrlDefault) -> None:
 @app.command("watch")
 def watch_task(task_id: TaskId, url: Url = UrlDefault) -> None:
     """Show the progress of a task until it ends."""
+    client = client_of(url)
     try:
-        task = follow(client_of(url), task_id)
+        task = follow(client, task_id)
     except KeyboardInterrupt:
-        console.print(f"task {task_id} goes on: `panelwright task cancel {task_id}` stops the arm and ends it")
+        cancel = client.addressed(f"`panelwright task cancel {task_id}`")
+        console.print(f"task {task_id} goes on: {cancel} stops the arm and ends it")
         raise typer.Exit(INTERRUPTED) from None
     raise typer.Exit(0 if task["state"] == "succeeded" else 1)
 
@@ -61,7 +63,8 @@ def follow(client: Client, task_id: str) -> dict[str, Any]:
     task: dict[str, Any] = client.get(f"/v1/tasks/{task_id}")
     console.print(f"task {task_id} [{state_style(task['state'])}]{task['state']}[/]")
     if task["problem"] is not None:
-        console.print(f"  {escape(task['problem']['detail'])}\n  try    {escape(task['problem']['hint'])}")
+        hint = client.addressed(task["problem"]["hint"])
+        console.print(f"  {escape(task['problem']['detail'])}\n  try    {escape(hint)}")
     return task
 
 

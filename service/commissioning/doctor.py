@@ -5,8 +5,10 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
@@ -19,6 +21,9 @@ from service.commissioning.cell_check import objects_in_reach
 from service.commissioning.preflight import check_machine, check_python, check_simulator
 from service.processes.stop_host import bound_socket
 from service.terminal import console, find_cell
+
+if TYPE_CHECKING:
+    from service.processes.supervisor import Supervisor
 
 PINNED = {"pybullet": "3.2.7", "numpy": "2.", "opencv-python-headless": "4."}
 READS = 20
@@ -44,10 +49,9 @@ def examine(cell: Path, port: int, *, connect: bool) -> bool:
     ]
     results = [_check(name, check) for name, check in checks]
     may_connect = connect and served is None  # two programs must not control one arm
-    if may_connect and all(results):
-        results.append(_wires(load_cell(find_cell(cell))))
-    if may_connect and all(results):
-        results.append(_check("devices", lambda: _devices(load_cell(find_cell(cell)))))
+    if may_connect and all(results):  # one broken device hides no other: ports and all devices are examined
+        loaded = load_cell(find_cell(cell))
+        results += [_wires(loaded), _devices(loaded)]
     return all(results)
 
 
@@ -55,12 +59,16 @@ def _check(name: str, check: Callable[[], str]) -> bool:
     try:
         words = check()
     except CellError as error:
-        console.print(f"[red]wrong[/]  {name:<24} {escape(error.what)}\n{'':<31} try: {escape(error.hint)}")
+        _show_wrong(name, error.what, error.hint)
         for line in detail_lines(error.details):
             console.print(f"{'':<29} {escape(line)}")
         return False
     console.print(f"[green]good[/]   {name:<24} {escape(words)}")
     return True
+
+
+def _show_wrong(name: str, what: str, hint: str) -> None:
+    console.print(f"[red]wrong[/]  {name:<24} {escape(what)}\n{'':<31} try: {escape(hint)}")
 
 
 def _wires(cell: Cell) -> bool:
@@ -146,27 +154,41 @@ def _timer() -> str:
     return f"2 ms sleeps return late by {1e3 * lates_s[100]:.2f} ms (median), {1e3 * lates_s[197]:.2f} ms (p99)"
 
 
-def _devices(cell: Cell) -> str:
+def _devices(cell: Cell) -> bool:
+    """Start the cell with the devices that connect, and time each of them; returns whether all answer."""
     from service.processes.supervisor import Supervisor
-    from service.readings import READS as METHODS
 
-    supervisor = Supervisor(cell)
+    supervisor = Supervisor(cell, partial=True)
     try:
         started_s = time.monotonic()
-        supervisor.start()
-        console.print(f"       {'cell process':<24} ready in {time.monotonic() - started_s:.1f} s")
-        for name, section in cell.file.devices.items():
-            device = supervisor.connection.device(name)
-            times_s = []
-            for _ in range(READS):
-                read_s = time.monotonic()
-                getattr(device, METHODS[section.kind])(deadline=Deadline.after(supervisor.connection.clock, 2.0))
-                times_s.append(time.monotonic() - read_s)
-            times_s.sort()
-            median_ms, worst_ms = 1e3 * times_s[READS // 2], 1e3 * times_s[-1]
-            console.print(
-                f"       {name:<24} read in {median_ms:.1f} ms (median), {worst_ms:.1f} ms (worst of {READS})"
-            )
+        if not _check("cell process", lambda: _started(supervisor, started_s)):
+            return False
+        missing = {one.device: one for one in supervisor.missing}
+        for one in missing.values():
+            _show_wrong(one.device, one.why, one.hint)
+        there = [name for name in cell.file.devices if name not in missing]
+        answers = [_check(name, partial(_timed, supervisor, cell, name)) for name in there]
+        return not missing and all(answers)
     finally:
         supervisor.close()
-    return f"all {len(cell.file.devices)} answer"
+
+
+def _started(supervisor: Supervisor, started_s: float) -> str:
+    supervisor.start()
+    return f"ready in {time.monotonic() - started_s:.1f} s"
+
+
+def _timed(supervisor: Supervisor, cell: Cell, name: str) -> str:
+    """Read the device `name` several times; returns in words how long that took."""
+    from service.readings import READS as METHODS
+
+    device = supervisor.connection.device(name)
+    times_s = []
+    for _ in range(READS):
+        read_s = time.monotonic()
+        getattr(device, METHODS[cell.file.devices[name].kind])(
+            deadline=Deadline.after(supervisor.connection.clock, 2.0)
+        )
+        times_s.append(time.monotonic() - read_s)
+    times_s.sort()
+    return f"read in {1e3 * times_s[READS // 2]:.1f} ms (median), {1e3 * times_s[-1]:.1f} ms (worst of {READS})"

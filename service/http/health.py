@@ -24,17 +24,23 @@ async def healthz() -> HealthzView:
 
 @router.get(
     "/readyz",
-    summary="Whether the cell is ready",
+    summary="Whether the cell is ready, and for what",
     operation_id="readyz",
-    responses={503: {"description": "the cell is not ready", "model": ReadyView}},
+    responses={503: {"description": "the cell is not running", "model": ReadyView}},
     response_model=ReadyView,
 )
 async def readyz(state: State) -> JSONResponse:
-    supervisor = state.service.supervisor
-    processes = [ProcessView(**asdict(process)) for process in supervisor.processes()]
-    missing = [MissingView(**asdict(device)) for device in supervisor.missing]
-    view = ReadyView(is_ready=supervisor.is_ready, missing=missing, processes=processes)
-    return JSONResponse(view.model_dump(mode="json"), 200 if supervisor.is_ready else 503)
+    service = state.service
+    supervisor, is_running = service.supervisor, service.supervisor.is_ready
+    missing = [MissingView(**asdict(one), lost=list(service.lost_without(one.device))) for one in supervisor.missing]
+    view = ReadyView(
+        is_ready=is_running and not missing,
+        is_running=is_running,
+        missing=missing,
+        lacking={verb: list(devices) for verb, devices in service.lacking().items()},
+        processes=[ProcessView(**asdict(process)) for process in supervisor.processes()],
+    )
+    return JSONResponse(view.model_dump(mode="json"), 200 if is_running else 503)
 
 
 @router.get(

@@ -65,6 +65,8 @@ class Metrics:
         yield GaugeMetricFamily("panelwright_stop_latched", "1 while the software stop is latched", value=latched)
         ready = float(self._service.supervisor.is_ready)
         yield GaugeMetricFamily("panelwright_cell_ready", "1 while the cell process is up", value=ready)
+        missing = float(len(self._service.supervisor.missing))
+        yield GaugeMetricFamily("panelwright_devices_missing", "devices that are not connected", value=missing)
         restarts = CounterMetricFamily("panelwright_restarts", "restarts of supervised processes", labels=["process"])
         for process in self._service.supervisor.processes():
             restarts.add_metric([process.name], process.restarts)

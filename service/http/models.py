@@ -252,18 +252,26 @@ class ProcessView(BaseModel):
 
 
 class MissingView(BaseModel):
-    """A device that did not connect; the cell works without it."""
+    """A device that did not connect; the cell works without it, and the verbs in `lost` may fail."""
 
     device: str
     why: str
     hint: str
+    lost: list[str]
 
 
 class ReadyView(BaseModel):
-    """Whether the cell is ready, and which devices are missing."""
+    """Whether the cell is ready for everything, and otherwise for what.
+
+    `is_ready` is true when the cell runs and no device is missing. `is_running` is true when the cell runs, even if devices
+    are missing; it decides the status, 200 or 503. `lacking` has for each verb the missing devices that it may need: a verb
+    with none is ready, and one with some may fail, depending on the request.
+    """
 
     is_ready: bool
+    is_running: bool
     missing: list[MissingView]
+    lacking: dict[str, list[str]]
     processes: list[ProcessView]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from hal.config import Cell
+from hal.devices import DeviceKind
 from service.operations.session import OperationContext, Session, check_looked_for
 from service.schema import fuse_request, fuse_results, mission_results, requests, results
 
@@ -27,6 +28,7 @@ class Operation:
         summary: one line for the API document.
         example: a body that works on the shipped cell.
         moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
+        needs: kinds of devices that it may need in addition to those of every motion (`moves`).
         is_still: returns whether a given request moves nothing although the verb may move the arm.
         check: raises `InvalidRequest`, before a task is created, for a request that is not possible in this cell.
     """
@@ -38,6 +40,7 @@ class Operation:
     summary: str
     example: dict[str, Any] = field(default_factory=dict)
     moves: bool = True
+    needs: tuple[DeviceKind, ...] = ()
     is_still: Callable[[Any], bool] = field(default=lambda _request: False)
     check: Callable[[Cell, Any], None] = field(default=lambda _cell, _request: None)
 
@@ -100,6 +103,7 @@ def _is_stored(request: requests.StoredLook) -> bool:
     return request.image is not None
 
 
+SENSORS = (DeviceKind.CAMERA, DeviceKind.LIGHTS, DeviceKind.RANGE_SCANNER)
 OPERATIONS: dict[str, Operation] = {
     operation.name: operation
     for operation in (
@@ -108,6 +112,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.PanelPoseRequest,
             result_model=results.PanelPoseResult,
             run=_in_session("locate", "run_panel_pose"),
+            needs=(DeviceKind.CAMERA, DeviceKind.LIGHTS, DeviceKind.RANGE_SCANNER),
             summary="Locate the panel by its four lights; the answer is its pose with covariance",
             example={"move": True},
         ),
@@ -116,6 +121,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.RecogniseRequest,
             result_model=results.RecogniseResult,
             run=_in_session("recognise", "run_recognise"),
+            needs=(DeviceKind.CAMERA, DeviceKind.RANGE_SCANNER),
             summary="Find the panel's objects in the camera's image or surfaces in the range image",
             example={"use": ["vision"], "mode": "taught"},
             check=check_looked_for,
@@ -126,6 +132,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.LearnRequest,
             result_model=results.LearnResult,
             run=_in_session("recognise", "run_learn"),
+            needs=(DeviceKind.CAMERA,),
             summary="Learn what the objects of the located panel look like, for blind recognition",
             example={"move": True},
             is_still=_is_stored,
@@ -135,6 +142,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.InspectRequest,
             result_model=results.InspectResult,
             run=_in_session("inspect", "run_inspect"),
+            needs=(DeviceKind.CAMERA,),
             summary="Read instruments, lamps, switches and valves from close up",
             example={"objects": ["pressure", "main_valve"], "least_confidence": 0.5},
             check=check_looked_for,
@@ -145,6 +153,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=fuse_request.FuseRequest,
             result_model=fuse_results.FuseResult,
             run=_in_session("sense", "run_fuse"),
+            needs=SENSORS,
             summary="Fuse measurements of nine kinds into one pose, or collect them first",
             example={"measurements": [MEASUREMENT_EXAMPLE]},
         ),
@@ -153,6 +162,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.ManipulateRequest,
             result_model=mission_results.ManipulateResult,
             run=_in_session("manipulate", "run_manipulate"),
+            needs=(DeviceKind.CAMERA,),
             summary="Operate one control and read back whether it reached its target",
             example={"object": "main_valve", "state": "open"},
             check=_checked_by("check_manipulate"),
@@ -162,6 +172,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.MissionRequest,
             result_model=mission_results.MissionResult,
             run=_mission,
+            needs=SENSORS,
             summary="Run the whole mission and write its report",
             example={"touches": 4},
             check=_checked_by("check_mission"),
@@ -171,6 +182,7 @@ OPERATIONS: dict[str, Operation] = {
             request_model=requests.CalibrationRequest,
             result_model=results.CalibrationResult,
             run=_in_session("calibrate", "run_calibrations"),
+            needs=SENSORS,
             summary="Calibrate camera, hand-eye, range scanner or tool; the arm drives through poses, and the record is stored",
             example={"what": "hand-eye", "poses": 12},
             is_still=lambda request: request.dry_run,

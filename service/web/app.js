@@ -20,7 +20,9 @@ async function watchService() {
     const sick = ready.processes.find((process) => process.detail) || {};
     document.body.classList.remove("lost");
     banner.hidden = ready.is_ready;
-    banner.textContent = `The cell is not ready. ${sick.detail || "It is starting."}`;
+    banner.textContent = ready.is_running
+      ? `Without ${ready.missing.map((one) => `${one.device} (lost: ${one.lost.join(", ") || "its readings"})`).join("; ")}`
+      : `The cell is not ready. ${sick.detail || "It is starting."}`;
   } catch {
     document.body.classList.add("lost"); // the page shows the last known state
     banner.hidden = false;

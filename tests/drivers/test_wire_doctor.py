@@ -86,6 +86,13 @@ def test_a_device_that_never_answers_keeps_its_own_words(tmp_path: Path) -> None
     assert (found.what, found.hint) == ("finger is silent", "power?")
 
 
+def test_a_serial_device_with_a_wrong_option_is_one_finding_among_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "tty"
+    path.touch()
+    (found,) = examine_device("finger", "serial:tfmini", {"port": str(path), "buad": 1}, str(path))
+    assert not found.is_good and "buad" in found.what
+
+
 class NoisyAtOtherBauds(PtyPort):
     """Port on which a wrong baud rate gives noise."""
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, cast
 import pytest
 
 from hal.errors import ConfigError, DeviceUnavailable
-from service.client import ApiError, Client
+from service.client import DEFAULT_URL, ApiError, Client, for_service
 from service.commands.own_cell import run_task
 from service.processes.latch import Latch
 from service.processes.stop_host import InlineStop, bound_socket
@@ -167,3 +167,57 @@ def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None
 def test_a_proxy_of_the_environment_is_not_asked(scripted: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:1")
     assert scripted.get("/v1/tasks/7")["state"] == "running"
+
+
+AT = "http://127.0.0.1:9000"
+
+
+@pytest.mark.parametrize(
+    ("hint", "addressed"),
+    [
+        ("run `panelwright devices` and look", f"run `panelwright devices --url {AT}` and look"),
+        ("then `panelwright stop --reset`, later", f"then `panelwright stop --reset --url {AT}`, later"),
+        ("`panelwright calibrate camera --device c`", f"`panelwright calibrate camera --device c --url {AT}`"),
+        ("`panelwright task cancel t1 --url http://b`", "`panelwright task cancel t1 --url http://b`"),
+        ("`panelwright devices read x --cell c.toml`", "`panelwright devices read x --cell c.toml`"),
+        ("`panelwright devices record x out`; `panelwright doctor`", None),
+        (
+            "`panelwright task list` or `panelwright stop --url http://b`",
+            f"`panelwright task list --url {AT}` or `panelwright stop --url http://b`",
+        ),
+    ],
+)
+def test_a_command_in_a_hint_names_the_service_at_hand(hint: str, addressed: str | None) -> None:
+    assert for_service(hint, AT + "/") == (hint if addressed is None else addressed)
+    assert for_service(hint, DEFAULT_URL) == hint
+    assert Client(url=AT, is_lasting=False).addressed(hint) == hint
+
+
+class Refusing(BaseHTTPRequestHandler):
+    """Service that answers each request with a problem."""
+
+    def do_GET(self) -> None:
+        body = json.dumps({"detail": "silent", "hint": "run `panelwright devices`"}).encode()
+        self.send_response(503)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Do not log."""
+
+
+def test_the_hint_of_a_problem_names_the_service_that_was_asked() -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        with pytest.raises(ApiError) as refused:
+            Client(url=url).get("/v1/devices")
+        server.shutdown()
+    assert refused.value.hint == f"run `panelwright devices --url {url}`"
+
+
+def test_nobody_at_another_port_is_answered_with_that_port() -> None:
+    with pytest.raises(DeviceUnavailable) as refused:
+        Client(url="http://127.0.0.1:9").get("/readyz")
+    assert "`panelwright serve --port 9`" in refused.value.hint

@@ -13,7 +13,9 @@ from hal.errors import ConfigError
 from hal.registry import Context, device_factory, installed_drivers, kinds_of, options_model
 from service.commissioning.cell_check import check_cell, objects_in_reach, unit_faults
 from service.commissioning.doctor import examine
+from service.processes.stop_host import bound_socket
 from service.terminal import console
+from tests.service.conftest import WriteCell
 
 ROOT = Path(__file__).parents[3]
 BENCH = (ROOT / "cells/bench.toml").read_text()
@@ -113,6 +115,31 @@ def test_the_doctor_does_not_call_such_a_file_in_order_and_connects_nothing(tmp_
     told = " ".join(seen.get().split())
     assert "wrong cell file" in told
     assert "did you mean 'width'?" in told and "devices.wrist_camera.mount: is missing" in told
+
+
+ABSENT = """
+[devices.{name}]
+kind = "lights"
+driver = "modbus:lights"
+options = {{ port = "/dev/serial/by-id/{name}", unit = {unit} }}
+"""
+
+
+def test_the_doctor_examines_every_device_although_serial_ones_are_broken(
+    write_cell: WriteCell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    extra = "".join(ABSENT.format(name=name, unit=k) for k, name in enumerate(("near_lights", "far_lights"), 1))
+    path = write_cell(robot=True, options={"panel_lights": {"fail": "no answer"}}, extra=extra)
+    with bound_socket("127.0.0.1", 0) as free:
+        port = free.getsockname()[1]
+    with console.capture() as seen:
+        assert not examine(path, port, connect=True)
+    told = " ".join(seen.get().split())
+    for name in ("near_lights", "far_lights"):
+        assert f"wrong {name} /dev/serial/by-id/{name} does not exist" in told
+    assert "wrong panel_lights" in told
+    assert "good arm read in" in told and "good finger_touch read in" in told
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

@@ -13,13 +13,23 @@ import pytest
 
 from hal.config import load_cell
 from hal.errors import CellError
+from service.client import DEFAULT_URL
+from service.commands.serve import announcement
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 from tests.service.verbs import OPERATIONS
 from tests.service.waiting import eventually
 
-Serve = Callable[..., httpx2.Client]
 AWAY = "away"
+
+
+class ServedClient(httpx2.Client):
+    """Client of a service, which it also holds."""
+
+    panelwright: Panelwright
+
+
+Serve = Callable[..., ServedClient]
 
 
 @pytest.fixture
@@ -35,13 +45,14 @@ def serve(write_cell: WriteCell, trouble: Path, tmp_path: Path) -> Iterator[Serv
     """Yield a function that serves a cell of fakes in which the given devices are absent."""
     opened: list[Any] = []
 
-    def serve(*away: str, inline: bool = True) -> httpx2.Client:
+    def serve(*away: str, inline: bool = True) -> ServedClient:
         path = write_cell(robot=True, options={name: {"trouble": str(trouble)} for name in away})
         options = Options(port=0, runs_dir=tmp_path / "runs", inline=inline, partial=True, warm=False)
         panelwright = Panelwright(load_cell(path), options, operations=OPERATIONS)
         opened.append(panelwright)
         panelwright.start()
-        http = httpx2.Client(base_url=panelwright.url, timeout=60.0, trust_env=False)
+        http = ServedClient(base_url=panelwright.url, timeout=60.0, trust_env=False)
+        http.panelwright = panelwright
         opened.append(http)
         return http
 
@@ -68,6 +79,30 @@ def test_what_is_missing_is_named_and_the_rest_works(serve: Serve, trouble: Path
     assert http.post("/v1/devices/finger_proximity/connect").json()["health"]["connected"]
     assert http.post("/v1/measure?wait_s=10").json()["result"] == {"distance_m": 0.123}
     assert [each["device"] for each in http.get("/readyz").json()["missing"]] == ["panel_lights"]
+
+
+def test_readiness_says_what_is_missing_and_what_is_lost_without_it(serve: Serve, trouble: Path) -> None:
+    http = serve("panel_lights", "finger_touch")
+    ready = http.get("/readyz")
+    assert (ready.status_code, ready.json()["is_running"], ready.json()["is_ready"]) == (200, True, False)
+    lost = {each["device"]: each["lost"] for each in ready.json()["missing"]}
+    assert lost == {"panel_lights": [], "finger_touch": ["hold", "wait"]}
+    lacking = ready.json()["lacking"]
+    assert (lacking["echo"], lacking["hold"]) == ([], ["finger_touch"])
+    assert "panelwright_devices_missing 2.0" in http.get("/metrics").text
+    trouble.unlink()
+    for name in lost:
+        http.post(f"/v1/devices/{name}/connect")
+    assert http.get("/readyz").json()["is_ready"]
+
+
+def test_serve_says_what_is_lost_and_names_the_service_in_the_remedy(serve: Serve) -> None:
+    served = serve("finger_touch")
+    service, url = served.panelwright.service, served.panelwright.url
+    told = "\n".join(announcement(service, url, "http://x/v1/stop"))
+    assert f"`panelwright devices connect finger_touch --url {url}`" in told
+    assert "lost   hold, wait" in told and "without 1 of 8 devices" in told
+    assert "--url" not in "\n".join(announcement(service, DEFAULT_URL, "http://x/v1/stop"))
 
 
 @pytest.mark.parametrize("name", ["arm", "gripper", "wrist_ft", "finger_touch", "finger_proximity"])

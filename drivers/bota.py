@@ -36,8 +36,15 @@ class BotaOptions(SerialOptions, RangeOptions):
     """Options of `serial:bota`; `sinc_length` sets the rate: 512 gives 100 Hz, 64 gives 800 Hz."""
 
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 460_800
-    sinc_length: Annotated[int, Field(ge=51, le=512)] = 512
-    max_age_s: Annotated[float, Field(gt=0, le=1)] = 0.05
+    sinc_length: Annotated[
+        int,
+        Field(
+            ge=51,
+            le=512,
+            description="length of the sensor's filter, which sets the rate: 512 gives 100 Hz, 64 gives 800 Hz",
+        ),
+    ] = 512
+    max_age_s: Annotated[float, Field(gt=0, le=1, description="an older sample is not returned")] = 0.05
 
 
 def framer() -> Framer:

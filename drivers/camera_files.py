@@ -23,11 +23,11 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 class CameraFilesOptions(LensOptions):
     """Options of `files:camera`: `path` is a folder of pictures, in the order of their names, or a video."""
 
-    path: Path
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    is_colour: bool = True
-    repeat: bool = True
-    exposure_s: Annotated[float, Field(gt=0)] = 0.01
+    path: Annotated[Path, Field(description="folder of pictures, read in the order of their names, or a video file")]
+    rate_hz: Annotated[float, Field(gt=0, le=1000, description="pictures per second")] = 10.0
+    is_colour: Annotated[bool, Field(description="whether the images are RGB; else they are grey")] = True
+    repeat: Annotated[bool, Field(description="whether to begin again after the last picture")] = True
+    exposure_s: Annotated[float, Field(gt=0, description="exposure time that the readings state")] = 0.01
 
 
 class CameraFiles(FilePlayer[Image]):

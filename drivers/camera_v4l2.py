@@ -29,12 +29,19 @@ EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
 class CameraV4l2Options(LensOptions, WireOptions):
     """Options of `v4l2:camera`; a name under `/dev/v4l/by-id` survives re-plugging."""
 
-    device: Path = Path("/dev/video0")
-    width_px: Annotated[int, Field(ge=16, le=10_000)] = 640
-    height_px: Annotated[int, Field(ge=16, le=10_000)] = 480
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
-    is_colour: bool = True
-    exposure_s: Annotated[float, Field(gt=0, le=1)] | None = None
+    device: Annotated[
+        Path,
+        Field(
+            description="device file; a name under `/dev/v4l/by-id` stays the same when the camera is plugged in again"
+        ),
+    ] = Path("/dev/video0")
+    width_px: Annotated[int, Field(ge=16, le=10_000, description="width of the image that is asked for")] = 640
+    height_px: Annotated[int, Field(ge=16, le=10_000, description="height of the image that is asked for")] = 480
+    rate_hz: Annotated[float, Field(gt=0, le=1000, description="images per second that are asked for")] = 30.0
+    is_colour: Annotated[bool, Field(description="whether the images are RGB; else they are grey")] = True
+    exposure_s: Annotated[
+        Annotated[float, Field(gt=0, le=1)] | None, Field(description="exposure time; automatic exposure if not given")
+    ] = None
 
     def claims(self) -> tuple[ResourceClaim, ...]:
         """Claim the camera."""

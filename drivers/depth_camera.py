@@ -31,17 +31,23 @@ SUFFIXES = (".png", ".npy", ".npz")
 class DepthCameraOptions(Strict):
     """Options of `files:depth`; the lens is that of the recording camera's data sheet."""
 
-    path: Path
-    fx: Annotated[float, Field(gt=0)]
-    fy: Annotated[float, Field(gt=0)]
-    cx: float
-    cy: float
-    projection: Literal["pinhole", "orthographic"] = "pinhole"
-    unit_m: Annotated[float, Field(gt=0)] = 0.001
-    min_range_m: Annotated[float, Field(ge=0)] = 0.1
-    max_range_m: Annotated[float, Field(gt=0)] = 10.0
-    sigma_m: Annotated[float, Field(gt=0)] = 0.003
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    path: Annotated[
+        Path, Field(description="folder of 16-bit PNG, `.npy` or `.npz` depth images, read in the order of their names")
+    ]
+    fx: Annotated[
+        float, Field(gt=0, description="focal length along the rows, px; for an orthographic projection px per metre")
+    ]
+    fy: Annotated[float, Field(gt=0, description="focal length along the columns, as `fx`")]
+    cx: Annotated[float, Field(description="column of the principal point, px")]
+    cy: Annotated[float, Field(description="row of the principal point, px")]
+    projection: Annotated[
+        Literal["pinhole", "orthographic"], Field(description="projection of the recording camera")
+    ] = "pinhole"
+    unit_m: Annotated[float, Field(gt=0, description="length of one step of the values in integer images")] = 0.001
+    min_range_m: Annotated[float, Field(ge=0, description="a smaller depth has no value")] = 0.1
+    max_range_m: Annotated[float, Field(gt=0, description="a larger depth has no value")] = 10.0
+    sigma_m: Annotated[float, Field(gt=0, description="noise of one pixel, one sigma")] = 0.003
+    rate_hz: Annotated[float, Field(gt=0, le=1000, description="images per second")] = 10.0
 
 
 class DepthCamera(FilePlayer[RangeImage]):

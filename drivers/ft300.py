@@ -42,8 +42,17 @@ class StreamOptions(SerialOptions, RangeOptions):
     """Options of `serial:ft300`."""
 
     baud: Annotated[int, Field(ge=300, le=4_500_000)] = 19_200
-    unit: Annotated[int, Field(ge=1, le=247)] = 9
-    max_age_s: Annotated[float, Field(gt=0, le=1)] = 0.16  # Robotiq's own code gives up after 160 ms
+    unit: Annotated[
+        int,
+        Field(
+            ge=1,
+            le=247,
+            description="Modbus address of the sensor, to which the command that starts the stream is sent",
+        ),
+    ] = 9
+    max_age_s: Annotated[float, Field(gt=0, le=1, description="an older sample is not returned")] = (
+        0.16  # Robotiq's own code gives up after 160 ms
+    )
 
 
 class PollOptions(ModbusOptions, RangeOptions):

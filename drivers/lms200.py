@@ -42,11 +42,16 @@ KEPT_BYTES = 4096
 class Lms200Options(SerialOptions):
     """Options of `serial:lms200`."""
 
-    baud: Literal[9600, 19200, 38400, 500000] = 38_400
-    field_deg: Literal[100, 180] = 180
-    step_hundredths_deg: Literal[25, 50, 100] = 100
-    max_range_m: Annotated[float, Field(gt=0, le=80)] = 8.0
-    sigma_m: Annotated[float, Field(gt=0)] = 0.015
+    baud: Annotated[
+        Literal[9600, 19200, 38400, 500000],
+        Field(description="baud rate that the scanner is set to; it is found at any of the four"),
+    ] = 38_400
+    field_deg: Annotated[Literal[100, 180], Field(description="angle of the field of view")] = 180
+    step_hundredths_deg: Annotated[
+        Literal[25, 50, 100], Field(description="angle between two beams, in hundredths of a degree")
+    ] = 100
+    max_range_m: Annotated[float, Field(gt=0, le=80, description="a larger distance has no value")] = 8.0
+    sigma_m: Annotated[float, Field(gt=0, description="noise of one distance, one sigma")] = 0.015
 
 
 def telegram(payload: bytes, *, address: int = 0) -> bytes:

@@ -34,7 +34,9 @@ class IoOptions(ModbusOptions):
     """Options that all points of a remote I/O share: `port = 502` with `host` for TCP, a path for RTU."""
 
     shared_as: ClassVar[str | None] = "remote I/O"
-    inputs: Annotated[int, Field(ge=1, le=256)] = 8
+    inputs: Annotated[
+        int, Field(ge=1, le=256, description="number of discrete inputs that are read in one request")
+    ] = 8
 
     @model_validator(mode="after")
     def _points_exist(self) -> Self:
@@ -55,11 +57,18 @@ class LightsOptions(IoOptions):
     `channels` names them; by default they have the names in the cell's panel file.
     """
 
-    channels: tuple[str, ...] | None = None
-    outputs: tuple[Point, ...] = (0, 1, 2, 3)
-    feedback: tuple[Point, ...] = (0, 1, 2, 3)
-    settle_s: Seconds = 0.05
-    stop_input: Point | None = 7
+    channels: Annotated[
+        tuple[str, ...] | None, Field(description="names of the lights; those of the cell's panel file if not given")
+    ] = None
+    outputs: Annotated[tuple[Point, ...], Field(description="coil of each light")] = (0, 1, 2, 3)
+    feedback: Annotated[
+        tuple[Point, ...], Field(description="discrete input that reports whether each light is lit")
+    ] = (0, 1, 2, 3)
+    settle_s: Annotated[Seconds, Field(description="time from switching to a true feedback")] = 0.05
+    stop_input: Annotated[
+        Point | None,
+        Field(description="discrete input of the stop circuit, which opens for a stop; none if it is not wired"),
+    ] = 7
 
     @model_validator(mode="after")
     def _one_point_a_light(self) -> Self:
@@ -74,9 +83,9 @@ class LightsOptions(IoOptions):
 class TouchOptions(IoOptions):
     """Options of `modbus:touch`: one input per pad."""
 
-    channels: tuple[str, ...] = ("left", "right")
-    contacts: tuple[Point, ...] = (4, 5)
-    threshold_n: Annotated[float, Field(gt=0)] = 1.0
+    channels: Annotated[tuple[str, ...], Field(description="names of the pads")] = ("left", "right")
+    contacts: Annotated[tuple[Point, ...], Field(description="discrete input of each pad")] = (4, 5)
+    threshold_n: Annotated[float, Field(gt=0, description="contact force that closes a pad")] = 1.0
 
     @model_validator(mode="after")
     def _one_point_a_pad(self) -> Self:
@@ -91,9 +100,9 @@ class TouchOptions(IoOptions):
 class SwitchOptions(IoOptions):
     """Options of `modbus:proximity`: a proximity switch as a sensor of one distance."""
 
-    input: Point = 6
-    switching_distance_m: Annotated[float, Field(gt=0)] = 0.02
-    sigma_m: Annotated[float, Field(gt=0)] = 0.002
+    input: Annotated[Point, Field(description="discrete input of the switch")] = 6
+    switching_distance_m: Annotated[float, Field(gt=0, description="distance at which the switch closes")] = 0.02
+    sigma_m: Annotated[float, Field(gt=0, description="scatter of that distance, one sigma")] = 0.002
 
     def wired(self) -> tuple[int, ...]:
         """Return the input of the switch."""

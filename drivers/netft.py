@@ -30,10 +30,16 @@ class NetftOptions(UdpOptions, RangeOptions):
     """Options of `udp:netft`; counts per newton and newton metre as the sensor's web page shows them."""
 
     port: PortNumber = 49_152
-    rate_hz: Annotated[float, Field(gt=0, le=7000)] = 500.0
-    counts_per_n: Annotated[float, Field(gt=0)] = 1_000_000.0
-    counts_per_nm: Annotated[float, Field(gt=0)] = 1_000_000.0
-    max_age_s: Annotated[float, Field(gt=0, le=1)] = 0.05
+    rate_hz: Annotated[
+        float, Field(gt=0, le=7000, description="records per second, as set on the sensor's web page")
+    ] = 500.0
+    counts_per_n: Annotated[float, Field(gt=0, description="counts per newton, from the sensor's web page")] = (
+        1_000_000.0
+    )
+    counts_per_nm: Annotated[float, Field(gt=0, description="counts per newton metre, from the sensor's web page")] = (
+        1_000_000.0
+    )
+    max_age_s: Annotated[float, Field(gt=0, le=1, description="an older sample is not returned")] = 0.05
 
 
 def request(command: int, count: int = 0) -> bytes:

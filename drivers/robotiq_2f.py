@@ -47,15 +47,17 @@ class GripperOptions(ModbusOptions):
     """Options of `modbus:robotiq_2f`; the counts at the ends of the stroke differ from gripper to gripper."""
 
     unit: Annotated[int, Field(ge=1, le=247)] = 9
-    stroke_m: Annotated[float, Field(gt=0, le=0.2)] = 0.085
-    open_count: Annotated[int, Field(ge=0, le=255)] = 3
-    closed_count: Annotated[int, Field(ge=1, le=255)] = 230
-    min_force_n: Annotated[float, Field(ge=0)] = 20.0
-    max_force_n: Annotated[float, Field(gt=0)] = 235.0
-    min_speed_m_per_s: Annotated[float, Field(ge=0)] = 0.02
-    max_speed_m_per_s: Annotated[float, Field(gt=0)] = 0.15
-    activate: bool = True
-    activation_s: Annotated[float, Field(gt=0, le=30)] = 8.0
+    stroke_m: Annotated[float, Field(gt=0, le=0.2, description="width between the jaws when open; measure it")] = 0.085
+    open_count: Annotated[int, Field(ge=0, le=255, description="position count when fully open; measure it")] = 3
+    closed_count: Annotated[int, Field(ge=1, le=255, description="position count when fully closed; measure it")] = 230
+    min_force_n: Annotated[float, Field(ge=0, description="grip force at the force value 0")] = 20.0
+    max_force_n: Annotated[float, Field(gt=0, description="grip force at the force value 255")] = 235.0
+    min_speed_m_per_s: Annotated[float, Field(ge=0, description="speed of the jaws at the speed value 0")] = 0.02
+    max_speed_m_per_s: Annotated[float, Field(gt=0, description="speed of the jaws at the speed value 255")] = 0.15
+    activate: Annotated[bool, Field(description="whether connecting activates the gripper, which moves its jaws")] = (
+        True
+    )
+    activation_s: Annotated[float, Field(gt=0, le=30, description="longest wait for the activation")] = 8.0
 
     @model_validator(mode="after")
     def _has_ranges(self) -> Self:

@@ -32,9 +32,13 @@ class ScipOptions(EitherOptions):
     """Options of `scip:scanner`: a serial path, or `host` with `port` (10940)."""
 
     port: SerialPath | PortNumber = 10940
-    cluster: Annotated[int, Field(ge=1, le=99)] = 1
-    skip_scans: Annotated[int, Field(ge=0, le=9)] = 0
-    sigma_m: Annotated[float, Field(gt=0)] = 0.01
+    cluster: Annotated[
+        int, Field(ge=1, le=99, description="neighbouring steps that the scanner merges into one beam")
+    ] = 1
+    skip_scans: Annotated[
+        int, Field(ge=0, le=9, description="scans that the scanner leaves out after each one it sends")
+    ] = 0
+    sigma_m: Annotated[float, Field(gt=0, description="noise of one distance, one sigma")] = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -47,10 +47,10 @@ def _exchange(link: Link, request: bytes, is_answered: Callable[[bytes], bool]) 
 class EchoOptions(Strict):
     """Keys of all sensors of the family: limits of echo strength and range for a valid distance."""
 
-    min_strength: Annotated[int, Field(ge=0, le=65_535)] = 100
-    min_range_m: Annotated[float, Field(ge=0)] = 0.0
-    max_range_m: Annotated[float, Field(gt=0, le=12)] = 12.0
-    sigma_m: Annotated[float, Field(gt=0)] = 0.005
+    min_strength: Annotated[int, Field(ge=0, le=65_535, description="a reading with a weaker echo is invalid")] = 100
+    min_range_m: Annotated[float, Field(ge=0, description="a smaller distance is invalid")] = 0.0
+    max_range_m: Annotated[float, Field(gt=0, le=12, description="a larger distance is invalid")] = 12.0
+    sigma_m: Annotated[float, Field(gt=0, description="noise of one reading, one sigma")] = 0.005
 
     def capabilities(self, rate_hz: float) -> ProximityCapabilities:
         """Return the capabilities given by the options; the data sheet's figures are for large, bright targets."""
@@ -74,8 +74,13 @@ class TfminiOptions(SerialOptions, EchoOptions):
     `unit` is the unit that the sensor is set to. A sensor that accepts no commands keeps its factory unit, cm.
     """
 
-    rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
-    unit: Literal["cm", "mm"] = "mm"
+    rate_hz: Annotated[float, Field(ge=1, le=1000, description="measurements per second that the sensor is set to")] = (
+        100.0
+    )
+    unit: Annotated[
+        Literal["cm", "mm"],
+        Field(description="unit that the sensor is set to; one that accepts no commands keeps its factory unit, cm"),
+    ] = "mm"
 
 
 def command(code: int, payload: bytes = b"") -> bytes:

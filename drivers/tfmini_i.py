@@ -38,10 +38,17 @@ class ModbusTfminiOptions(ModbusOptions, EchoOptions):
 class CanTfminiOptions(CanOptions, EchoOptions):
     """Options of `can:tfmini`; `id` is the CAN identifier of the sensor. The manual does not state the byte order."""
 
-    bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000] = 250_000
-    id: Annotated[int, Field(ge=0, le=0x7FF)] = 3
-    byte_order: Literal["little", "big"] = "little"
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
+    bitrate: Annotated[
+        Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000],
+        Field(description="bit rate of the bus, bit/s; a TF03 has 1000000"),
+    ] = 250_000
+    id: Annotated[int, Field(ge=0, le=0x7FF, description="CAN identifier of the sensor's frames")] = 3
+    byte_order: Annotated[
+        Literal["little", "big"], Field(description="order of the bytes of a number; the manual does not state it")
+    ] = "little"
+    rate_hz: Annotated[float, Field(gt=0, le=1000, description="measurements per second that the sensor is set to")] = (
+        100.0
+    )
 
     @property
     def stations(self) -> tuple[str, ...]:

@@ -28,8 +28,13 @@ MOVING_RAD_PER_S = 0.002
 class ArmOptions(SimOptions):
     """`model`: which arm. `lookahead_s`: of its drives, for an arm behind a wire (see `ArmDrive`)."""
 
-    model: Literal["t3", "ur10e"] = "t3"
-    lookahead_s: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    model: Annotated[Literal["t3", "ur10e"], Field(description="arm that is simulated")] = "t3"
+    lookahead_s: Annotated[
+        float,
+        Field(
+            ge=0, le=0.2, description="time over which the drives smooth set-points, for an arm behind an emulated wire"
+        ),
+    ] = 0.0
 
     def known_arm(self) -> ArmCapabilities:
         """Return kinematics and limits of the model."""

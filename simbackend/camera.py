@@ -24,15 +24,21 @@ FOCAL_RATIO = 460.0 / 640.0  # lens of the data sheet: 70 degrees across
 class CameraOptions(SimOptions):
     """Image size and what corrupts the image; see `SensorOptions`."""
 
-    width_px: Annotated[int, Field(ge=64, le=1600)] = 640
-    height_px: Annotated[int, Field(ge=64, le=1200)] = 480
-    colour: bool = False
-    exposure_s: Annotated[float, Field(gt=0, le=1)] = 0.010
-    oversample: Annotated[float, Field(ge=1, le=3)] = 2.0
-    blur_px: Annotated[float, Field(ge=0, le=10)] = 0.6
-    vignette: Annotated[float, Field(ge=0, le=1)] = 0.6
-    full_well_electrons: Annotated[float, Field(gt=0)] = 10_000.0
-    read_noise_electrons: Annotated[float, Field(ge=0)] = 20.0
+    width_px: Annotated[int, Field(ge=64, le=1600, description="width of the image")] = 640
+    height_px: Annotated[int, Field(ge=64, le=1200, description="height of the image")] = 480
+    colour: Annotated[bool, Field(description="whether the images are RGB; else they are grey")] = False
+    exposure_s: Annotated[float, Field(gt=0, le=1, description="exposure time; radiance 1 at 10 ms is full scale")] = (
+        0.010
+    )
+    oversample: Annotated[
+        float, Field(ge=1, le=3, description="rendered pixels per pixel of the image, along each axis")
+    ] = 2.0
+    blur_px: Annotated[float, Field(ge=0, le=10, description="blur of the lens, one sigma")] = 0.6
+    vignette: Annotated[float, Field(ge=0, le=1, description="loss of light towards the corners; 0 for none")] = 0.6
+    full_well_electrons: Annotated[
+        float, Field(gt=0, description="electrons at full scale, which set the shot noise")
+    ] = 10_000.0
+    read_noise_electrons: Annotated[float, Field(ge=0, description="noise of reading one pixel, one sigma")] = 20.0
 
 
 class SimCamera(SimDevice[Image]):

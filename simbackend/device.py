@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
+
+from pydantic import Field
 
 from hal.clock import Deadline
 from hal.devices import DeviceKind, Health
@@ -21,15 +23,15 @@ Options = TypeVar("Options", bound="SimOptions")
 class FaultOption(Strict):
     """`fault = { kind = "stale", at_s = 3.0 }`: begins at a simulated time."""
 
-    kind: Fault
-    magnitude: float = 0.0
-    at_s: float = 0.0
+    kind: Annotated[Fault, Field(description="fault that begins")]
+    magnitude: Annotated[float, Field(description="size of a bias, in the unit of the reading")] = 0.0
+    at_s: Annotated[float, Field(description="simulated time at which it begins")] = 0.0
 
 
 class SimOptions(Strict):
     """Options of every simulated device."""
 
-    fault: FaultOption | None = None
+    fault: Annotated[FaultOption | None, Field(description="fault that begins at a simulated time")] = None
 
 
 def parse(options: dict[str, Any], model: type[Options], context: Context) -> Options:

@@ -26,10 +26,12 @@ FORCES = np.repeat([1.0, 0.0], 3)  # an injected bias acts on the force only
 class ForceTorqueOptions(SimOptions):
     """Noise (one sigma) and slow drift (amplitude) of force and torque."""
 
-    force_sigma_n: Annotated[float, Field(ge=0, le=50)] = 0.15
-    torque_sigma_nm: Annotated[float, Field(ge=0, le=5)] = 0.004
-    force_drift_n: Annotated[float, Field(ge=0, le=50)] = 0.15
-    torque_drift_nm: Annotated[float, Field(ge=0, le=5)] = 0.004
+    force_sigma_n: Annotated[float, Field(ge=0, le=50, description="noise of the force, one sigma")] = 0.15
+    torque_sigma_nm: Annotated[float, Field(ge=0, le=5, description="noise of the torque, one sigma")] = 0.004
+    force_drift_n: Annotated[float, Field(ge=0, le=50, description="amplitude of the slow drift of the force")] = 0.15
+    torque_drift_nm: Annotated[float, Field(ge=0, le=5, description="amplitude of the slow drift of the torque")] = (
+        0.004
+    )
 
 
 class SimForceTorque(SimDevice[Wrench]):

@@ -22,8 +22,8 @@ MIN_RANGE_M = 0.02
 class ProximityOptions(SimOptions):
     """`sigma_m`: noise of one reading; `resolution_m`: its last digit."""
 
-    sigma_m: Annotated[float, Field(ge=0, le=0.05)] = 0.0008
-    resolution_m: Annotated[float, Field(gt=0, le=0.05)] = 0.0001
+    sigma_m: Annotated[float, Field(ge=0, le=0.05, description="noise of one reading, one sigma")] = 0.0008
+    resolution_m: Annotated[float, Field(gt=0, le=0.05, description="last digit of a reading")] = 0.0001
 
 
 class SimProximity(SimDevice[float]):

@@ -26,15 +26,31 @@ class RangeOptions(SimOptions):
     two surfaces, and `loss_ratio` of all pixels have no value.
     """
 
-    model: Literal["pinhole", "polar"] = "pinhole"
-    line_rate_hz: Annotated[float, Field(ge=1, le=100)] = 25.0
-    width: Annotated[int, Field(ge=16, le=512)] = 128
-    height: Annotated[int, Field(ge=16, le=512)] = 128
-    field_of_view_rad: Annotated[float, Field(gt=0.1, lt=2.0)] = 0.96  # wider, and the finger tips come into view
-    sigma_m: Annotated[float, Field(ge=0, le=0.1)] = 0.0006
-    bits: Annotated[int, Field(ge=6, le=24)] = 16
-    mixed_ratio: Annotated[float, Field(ge=0, le=1)] = 0.5
-    loss_ratio: Annotated[float, Field(ge=0, le=1)] = 0.003
+    model: Annotated[
+        Literal["pinhole", "polar"], Field(description="a range camera, or a line scanner that the wrist sweeps")
+    ] = "pinhole"
+    line_rate_hz: Annotated[float, Field(ge=1, le=100, description="lines per second of a line scanner")] = 25.0
+    width: Annotated[int, Field(ge=16, le=512, description="columns of the image, or beams of a line")] = 128
+    height: Annotated[int, Field(ge=16, le=512, description="rows of the image")] = 128
+    field_of_view_rad: Annotated[float, Field(gt=0.1, lt=2.0, description="field of view along the rows")] = (
+        0.96  # wider, and the finger tips come into view
+    )
+    sigma_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=0.1,
+            description="noise of one distance at 0.5 m, one sigma; it grows with the square of the distance",
+        ),
+    ] = 0.0006
+    bits: Annotated[
+        int, Field(ge=6, le=24, description="resolution of the range from 0.10 to 1.50 m; 8 as the paper's scanner")
+    ] = 16
+    mixed_ratio: Annotated[
+        float,
+        Field(ge=0, le=1, description="share of the pixels at a jump that report a depth between the two surfaces"),
+    ] = 0.5
+    loss_ratio: Annotated[float, Field(ge=0, le=1, description="share of all pixels that have no value")] = 0.003
 
 
 def corrupt(depth_m: Depth, options: RangeOptions, random: np.random.Generator) -> Depth:

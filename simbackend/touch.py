@@ -19,7 +19,7 @@ Contacts = tuple[bool, ...]
 class TouchOptions(SimOptions):
     """`threshold_n`: contact force that closes a switch."""
 
-    threshold_n: Annotated[float, Field(gt=0, le=50)] = 0.5
+    threshold_n: Annotated[float, Field(gt=0, le=50, description="contact force that closes a switch")] = 0.5
 
 
 class SimTouch(SimDevice[Contacts]):

@@ -49,13 +49,24 @@ class Cia402Options(CanOptions):
     The thread that sends the SYNCs requests `realtime_priority`, 0 for none; it is no error if the system refuses.
     """
 
-    nodes: tuple[Annotated[int, Field(ge=1, le=126)], ...] = (1, 2, 3, 4, 5, 6)
-    host_node: Annotated[int, Field(ge=1, le=127)] = 127
-    rate_hz: Annotated[float, Field(ge=10, le=500)] = 100.0
-    heartbeat_s: Annotated[float, Field(ge=0.02, le=1)] = 0.1
-    realtime_priority: Annotated[int, Field(ge=0, le=99)] = 10
-    degrees_per_increment: Annotated[float, Field(gt=0)] = 0.001
-    kinematics: KinematicsOptions
+    nodes: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=126)], ...], Field(description="node of the drive of each joint")
+    ] = (1, 2, 3, 4, 5, 6)
+    host_node: Annotated[
+        int, Field(ge=1, le=127, description="node of this computer, whose heartbeat the drives monitor")
+    ] = 127
+    rate_hz: Annotated[float, Field(ge=10, le=500, description="rate of SYNC messages and set-points")] = 100.0
+    heartbeat_s: Annotated[
+        float, Field(ge=0.02, le=1, description="period of this computer's heartbeat; the drives stop when it is lost")
+    ] = 0.1
+    realtime_priority: Annotated[
+        int,
+        Field(ge=0, le=99, description="priority that the thread of the SYNC messages asks the system for; 0 for none"),
+    ] = 10
+    degrees_per_increment: Annotated[
+        float, Field(gt=0, description="angle of one increment of the drives' position")
+    ] = 0.001
+    kinematics: Annotated[KinematicsOptions, Field(description="links, limits and speeds of the arm")]
 
     def known_arm(self) -> ArmCapabilities:
         """Return the kinematics and limits given by `kinematics`."""

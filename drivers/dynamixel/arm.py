@@ -53,13 +53,22 @@ INSTRUCTION_UNKNOWN = 2
 class DynamixelOptions(BusOptions):
     """Options of `serial:dynamixel`; `directions` inverts joints, `zero_counts` is the count of each joint at 0 rad."""
 
-    ids: tuple[Annotated[int, Field(ge=0, le=252)], ...] = (1, 2, 3, 4, 5, 6)
-    directions: tuple[Literal[-1, 1], ...] | None = None
-    zero_counts: tuple[int, ...] | None = None
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
-    watchdog_s: Annotated[float, Field(ge=0.02, le=2.5)] = 0.1
-    is_fast: bool = True
-    kinematics: KinematicsOptions
+    ids: Annotated[
+        tuple[Annotated[int, Field(ge=0, le=252)], ...], Field(description="id of the servo of each joint")
+    ] = (1, 2, 3, 4, 5, 6)
+    directions: Annotated[
+        tuple[Literal[-1, 1], ...] | None,
+        Field(description="-1 for each joint whose servo turns the other way; all 1 if not given"),
+    ] = None
+    zero_counts: Annotated[
+        tuple[int, ...] | None, Field(description="position count of each servo at 0 rad; 2048 if not given")
+    ] = None
+    rate_hz: Annotated[float, Field(gt=0, le=500, description="polls per second")] = 100.0
+    watchdog_s: Annotated[
+        float, Field(ge=0.02, le=2.5, description="time without a command after which each servo stops by itself")
+    ] = 0.1
+    is_fast: Annotated[bool, Field(description="whether to try the fast sync read, which new firmware has")] = True
+    kinematics: Annotated[KinematicsOptions, Field(description="links, limits and speeds of the arm")]
 
     def known_arm(self) -> ArmCapabilities:
         """Return the kinematics and limits given by `kinematics`."""

@@ -52,7 +52,7 @@ class BusOptions(SerialOptions):
     """Keys of every device on a Dynamixel bus."""
 
     baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 1_000_000
-    timeout_s: Annotated[float, Field(gt=0, le=1)] = 0.03
+    timeout_s: Annotated[float, Field(gt=0, le=1, description="wait for one answer")] = 0.03
 
     @property
     @abstractmethod

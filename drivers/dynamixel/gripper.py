@@ -50,15 +50,25 @@ class GripperOptions(BusOptions):
     """Options of `serial:dynamixel_gripper`; measure the counts at the ends of the stroke and the force per ampere on
     the gripper as built."""
 
-    id: Annotated[int, Field(ge=0, le=252)] = 7
-    rate_hz: Annotated[float, Field(gt=0, le=200)] = 50.0
-    watchdog_s: Annotated[float, Field(ge=0.02, le=2.5)] = 0.5
-    stroke_m: Annotated[float, Field(gt=0, le=0.3)] = 0.08
-    closed_count: Annotated[int, Field(ge=-(2**20), le=2**20)] = 2048
-    open_count: Annotated[int, Field(ge=-(2**20), le=2**20)] = 3072
-    newtons_per_ampere: Annotated[float, Field(gt=0)] = 60.0
-    max_force_n: Annotated[float, Field(gt=0)] = 60.0
-    activate: bool = True
+    id: Annotated[int, Field(ge=0, le=252, description="id of the servo")] = 7
+    rate_hz: Annotated[float, Field(gt=0, le=200, description="polls per second")] = 50.0
+    watchdog_s: Annotated[
+        float, Field(ge=0.02, le=2.5, description="time without a command after which the servo stops by itself")
+    ] = 0.5
+    stroke_m: Annotated[float, Field(gt=0, le=0.3, description="width between the jaws when open; measure it")] = 0.08
+    closed_count: Annotated[
+        int, Field(ge=-(2**20), le=2**20, description="position count when fully closed; measure it")
+    ] = 2048
+    open_count: Annotated[
+        int, Field(ge=-(2**20), le=2**20, description="position count when fully open; measure it")
+    ] = 3072
+    newtons_per_ampere: Annotated[
+        float, Field(gt=0, description="grip force per ampere of servo current; measure it")
+    ] = 60.0
+    max_force_n: Annotated[float, Field(gt=0, description="largest grip force that may be commanded")] = 60.0
+    activate: Annotated[
+        bool, Field(description="whether connecting switches the torque on, with the measured position as the goal")
+    ] = True
 
     @model_validator(mode="after")
     def _has_a_stroke(self) -> Self:

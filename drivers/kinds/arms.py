@@ -23,23 +23,25 @@ STEP_MARGIN = 3.0  # set-points arrive in bunches on a busy host; jumps of more 
 class LinkOptions(Strict):
     """One row of a standard Denavit-Hartenberg table."""
 
-    d_m: float
-    a_m: float
-    alpha_rad: float
-    offset_rad: float = 0.0
+    d_m: Annotated[float, Field(description="offset along the previous axis")]
+    a_m: Annotated[float, Field(description="length of the common normal")]
+    alpha_rad: Annotated[float, Field(description="twist about the common normal")]
+    offset_rad: Annotated[float, Field(description="joint angle of the table at 0 rad of the drive")] = 0.0
 
 
 class KinematicsOptions(Strict):
     """`kinematics` of an arm's options; the values are in the arm's data sheet."""
 
-    model: str
-    links: tuple[LinkOptions, ...]
-    lower_rad: tuple[float, ...]
-    upper_rad: tuple[float, ...]
-    velocity_rad_per_s: tuple[Positive, ...]
-    acceleration_rad_per_s2: tuple[Positive, ...]
-    tip_speed_m_per_s: Positive
-    link_radius_m: tuple[Positive, ...]
+    model: Annotated[str, Field(description="name of the arm, which errors and reports show")]
+    links: Annotated[
+        tuple[LinkOptions, ...], Field(description="rows of the standard Denavit-Hartenberg table, from the base")
+    ]
+    lower_rad: Annotated[tuple[float, ...], Field(description="lower limit of each joint")]
+    upper_rad: Annotated[tuple[float, ...], Field(description="upper limit of each joint")]
+    velocity_rad_per_s: Annotated[tuple[Positive, ...], Field(description="largest speed of each joint")]
+    acceleration_rad_per_s2: Annotated[tuple[Positive, ...], Field(description="largest acceleration of each joint")]
+    tip_speed_m_per_s: Annotated[Positive, Field(description="largest speed of the flange")]
+    link_radius_m: Annotated[tuple[Positive, ...], Field(description="radius of each link for collision checks")]
 
     @model_validator(mode="after")
     def _one_entry_a_joint(self) -> Self:

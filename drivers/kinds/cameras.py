@@ -18,8 +18,15 @@ Pixels = NDArray[np.uint8]
 class LensOptions(Strict):
     """Nominal lens of a camera that does not know its own; the calibration record has the true one."""
 
-    fx_px: Annotated[float, Field(gt=0)] | None = None
-    fy_px: Annotated[float, Field(gt=0)] | None = None
+    fx_px: Annotated[
+        Annotated[float, Field(gt=0)] | None,
+        Field(
+            description="focal length along the rows until the camera is calibrated; the width of the image if not given"
+        ),
+    ] = None
+    fy_px: Annotated[
+        Annotated[float, Field(gt=0)] | None, Field(description="focal length along the columns; `fx_px` if not given")
+    ] = None
 
 
 def nominal(width_px: int, height_px: int, lens: LensOptions) -> CameraIntrinsics:

@@ -48,12 +48,17 @@ class RplidarOptions(SerialOptions):
     `express` scans are protected by a checksum; the first A1 models do not support them.
     """
 
-    mode: Literal["standard", "express"] = "standard"
-    beams: Annotated[int, Field(ge=90, le=3600)] = 360
-    scan_rate_hz: Annotated[float, Field(gt=0, le=20)] = 5.5
-    min_range_m: Annotated[float, Field(ge=0)] = 0.15
-    max_range_m: Annotated[float, Field(gt=0)] = 12.0
-    sigma_m: Annotated[float, Field(gt=0)] = 0.01
+    mode: Annotated[
+        Literal["standard", "express"],
+        Field(description="`express` scans have a check sum; the first A1 models have only `standard`"),
+    ] = "standard"
+    beams: Annotated[
+        int, Field(ge=90, le=3600, description="equal sectors of a turn, each with its nearest measurement")
+    ] = 360
+    scan_rate_hz: Annotated[float, Field(gt=0, le=20, description="turns per second, as set at the motor")] = 5.5
+    min_range_m: Annotated[float, Field(ge=0, description="a smaller distance has no value")] = 0.15
+    max_range_m: Annotated[float, Field(gt=0, description="a larger distance has no value")] = 12.0
+    sigma_m: Annotated[float, Field(gt=0, description="noise of one distance, one sigma")] = 0.01
 
 
 def descriptor(length: int, mode: int, kind: int) -> bytes:

@@ -33,9 +33,17 @@ class CanOptions(Captured):
     `channel` is the path of an slcan adapter, `tcp://HOST:PORT` of one on the network, or an interface's name (`can0`).
     """
 
-    channel: str
-    bitrate: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000] = 1_000_000
-    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
+    channel: Annotated[
+        str,
+        Field(
+            description="path of an slcan adapter, `tcp://HOST:PORT` of one on the network, or the name of a SocketCAN interface"
+        ),
+    ]
+    bitrate: Annotated[
+        Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000],
+        Field(description="bit rate of the bus, bit/s"),
+    ] = 1_000_000
+    baud: Annotated[int, Field(ge=300, le=4_500_000, description="baud rate of the adapter's serial port")] = 115_200
 
     @property
     @abstractmethod

@@ -20,11 +20,11 @@ class ModbusOptions(EitherOptions):
     port: SerialPath | PortNumber = 502
     shared_as: ClassVar[str | None] = None
 
-    unit: Annotated[int, Field(ge=1, le=247)] = 1
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = 100.0
-    timeout_s: Seconds = 0.1
-    gap_s: Annotated[float, Field(ge=0, le=0.1)] = RTU_GAP_S
-    max_age_s: Seconds = 0.1
+    unit: Annotated[int, Field(ge=1, le=247, description="address of the device on the bus (unit, slave id)")] = 1
+    rate_hz: Annotated[float, Field(gt=0, le=500, description="polls per second")] = 100.0
+    timeout_s: Annotated[Seconds, Field(description="wait for one answer")] = 0.1
+    gap_s: Annotated[float, Field(ge=0, le=0.1, description="silence between two frames of RTU")] = RTU_GAP_S
+    max_age_s: Annotated[Seconds, Field(description="an older sample is not returned")] = 0.1
 
     @model_validator(mode="after")
     def _is_somewhere(self) -> Self:

@@ -28,8 +28,10 @@ LOOPBACK = "127.0.0.1"
 class Captured(WireOptions):
     """Keys of every driver with a link: `capture` writes all traffic to a file, `replay` reads a file instead."""
 
-    capture: Path | None = None
-    replay: Path | None = None
+    capture: Annotated[
+        Path | None, Field(description="file to which all traffic of the link is appended, as JSON lines")
+    ] = None
+    replay: Annotated[Path | None, Field(description="captured file that is read in place of the link")] = None
 
     def claims(self) -> tuple[ResourceClaim, ...]:
         """Return the claim on the link, or none when its traffic comes from a file."""
@@ -43,8 +45,13 @@ class Captured(WireOptions):
 class SerialOptions(Captured):
     """A serial port. Give `port` a stable name, from `/dev/serial/by-id`."""
 
-    port: SerialPath
-    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
+    port: Annotated[
+        SerialPath,
+        Field(description="path of the serial port; names under `/dev/serial/by-id` survive re-plugging"),
+    ]
+    baud: Annotated[int, Field(ge=300, le=4_500_000, description="baud rate of the line, as set in the device")] = (
+        115_200
+    )
 
     def claim(self) -> ResourceClaim:
         """Claim the serial port."""
@@ -54,8 +61,8 @@ class SerialOptions(Captured):
 class TcpOptions(Captured):
     """A TCP server."""
 
-    host: str
-    port: PortNumber
+    host: Annotated[str, Field(description="name or address of the device on the network")]
+    port: Annotated[PortNumber, Field(description="number of its TCP port")]
 
     def claim(self) -> ResourceClaim:
         """Claim the TCP connection."""
@@ -65,8 +72,8 @@ class TcpOptions(Captured):
 class UdpOptions(Captured):
     """A UDP server."""
 
-    host: str
-    port: PortNumber
+    host: Annotated[str, Field(description="name or address of the device on the network")]
+    port: Annotated[PortNumber, Field(description="number of its UDP port")]
 
     def claim(self) -> ResourceClaim:
         """Claim the remote address, which answers one client only."""
@@ -76,9 +83,15 @@ class UdpOptions(Captured):
 class EitherOptions(Captured):
     """Serial or TCP, by the type of `port`: a path, or a number with `host`."""
 
-    host: str | None = None
-    port: SerialPath | PortNumber
-    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 115_200
+    host: Annotated[
+        str | None, Field(description="name or address of the device on the network; this computer if not given")
+    ] = None
+    port: Annotated[
+        SerialPath | PortNumber, Field(description="path of a serial port, or the number of the TCP port of `host`")
+    ]
+    baud: Annotated[
+        int, Field(ge=300, le=4_500_000, description="baud rate of a serial line, as set in the device")
+    ] = 115_200
 
     @property
     def transport(self) -> Literal["tcp", "serial"]:

@@ -46,13 +46,29 @@ class UrOptions(rtde.RtdeOptions):
     """Options of `ur:rtde`."""
 
     owns: ClassVar[tuple[str, ...]] = ("the arm",)
-    script_port: PortNumber = 30_003
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = 500.0
-    kinematics: KinematicsOptions = Field(default_factory=ur10e)
-    brake_rad_per_s2: Annotated[float, Field(gt=0, le=40)] = 4.0
-    servo_gain: Annotated[int, Field(ge=100, le=2000)] = 500
-    lookahead_s: Annotated[float, Field(ge=0.03, le=0.2)] = 0.05
-    watchdog_s: Annotated[float, Field(ge=0.02, le=2)] = 0.1
+    script_port: Annotated[PortNumber, Field(description="TCP port that takes the servo program")] = 30_003
+    rate_hz: Annotated[
+        float,
+        Field(
+            gt=0, le=500, description="records per second that the controller is asked for; an e-Series has up to 500"
+        ),
+    ] = 500.0
+    kinematics: Annotated[
+        KinematicsOptions, Field(description="links, limits and speeds of the arm; those of a UR10e if not given")
+    ] = Field(default_factory=ur10e)
+    brake_rad_per_s2: Annotated[
+        float, Field(gt=0, le=40, description="deceleration with which the servo program stops each joint")
+    ] = 4.0
+    servo_gain: Annotated[
+        int, Field(ge=100, le=2000, description="`gain` of servoj: stiffness with which set-points are followed")
+    ] = 500
+    lookahead_s: Annotated[
+        float, Field(ge=0.03, le=0.2, description="`lookahead_time` of servoj: time over which set-points are smoothed")
+    ] = 0.05
+    watchdog_s: Annotated[
+        float,
+        Field(ge=0.02, le=2, description="time without a set-point after which the servo program brakes by itself"),
+    ] = 0.1
 
     def known_arm(self) -> ArmCapabilities:
         """Return the kinematics and limits given by `kinematics`."""

@@ -39,7 +39,9 @@ Point = Annotated[int, Field(ge=0, le=63)]
 class UrIoOptions(rtde.RtdeOptions):
     """Keys that lights and touch share."""
 
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
+    rate_hz: Annotated[
+        float, Field(gt=0, le=500, description="records per second that the controller is asked for")
+    ] = 125.0
 
 
 class UrLightsOptions(UrIoOptions):
@@ -47,10 +49,20 @@ class UrLightsOptions(UrIoOptions):
     without them the state of the output is reported."""
 
     owns: ClassVar[tuple[str, ...]] = ("the digital outputs",)
-    channels: tuple[str, ...] = ("top_left", "top_right", "bottom_right", "bottom_left")
-    outputs: tuple[Output, ...] = (0, 1, 2, 3)
-    feedback: tuple[Point, ...] | None = None
-    settle_s: Seconds = 0.05
+    channels: Annotated[tuple[str, ...], Field(description="names of the lights")] = (
+        "top_left",
+        "top_right",
+        "bottom_right",
+        "bottom_left",
+    )
+    outputs: Annotated[tuple[Output, ...], Field(description="standard digital output of each light")] = (0, 1, 2, 3)
+    feedback: Annotated[
+        tuple[Point, ...] | None,
+        Field(
+            description="digital input that reports whether each light is lit; without it the state of the output is reported"
+        ),
+    ] = None
+    settle_s: Annotated[Seconds, Field(description="time from switching to a true feedback")] = 0.05
 
     @model_validator(mode="after")
     def _one_point_a_light(self) -> Self:
@@ -61,9 +73,12 @@ class UrLightsOptions(UrIoOptions):
 class UrTouchOptions(UrIoOptions):
     """Options of `ur:touch`: an input for each pad; 16 and 17 are the tool's."""
 
-    channels: tuple[str, ...] = ("left", "right")
-    contacts: tuple[Point, ...] = (16, 17)
-    threshold_n: Annotated[float, Field(gt=0)] = 1.0
+    channels: Annotated[tuple[str, ...], Field(description="names of the pads")] = ("left", "right")
+    contacts: Annotated[tuple[Point, ...], Field(description="digital input of each pad; 16 and 17 are the tool's")] = (
+        16,
+        17,
+    )
+    threshold_n: Annotated[float, Field(gt=0, description="contact force that closes a pad")] = 1.0
 
     @model_validator(mode="after")
     def _one_point_a_pad(self) -> Self:

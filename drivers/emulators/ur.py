@@ -1,7 +1,7 @@
 """Emulated Universal Robots controller on three TCP ports (RTDE, script, dashboard) that moves any arm.
 
-It understands only the URScript that the driver sends: `stopj`, and a program that servos to the joint positions in
-RTDE registers and ends when the heartbeat register no longer changes.
+It understands only the URScript that the driver sends: `stopj`, and a program that waits for a heartbeat above the
+first one, then servos to the joint positions in RTDE registers, and ends when the heartbeat no longer changes.
 """
 
 from __future__ import annotations
@@ -44,6 +44,9 @@ INPUT_TYPES = {
 REGISTER = re.compile(r"read_input_integer_register\((\d+)\)")
 RUNNING, NORMAL, PROTECTIVE_STOP = 7, 1, 3
 STOPPED, PLAYING = 1, 2
+FIRST_BEAT = re.compile(r"first = (\d+)")
+FAR_BEATS = re.compile(r"last > first \+ (\d+)")
+WAIT_CYCLES = re.compile(r"waited < (\d+):")
 SILENT_CYCLES = re.compile(r"while silent < (\d+):")
 CYCLE_S = 0.002
 
@@ -119,9 +122,10 @@ class UrEmulator(WireEmulator):
         self._streams: set[Peer] = set()
         self._registers = [0] * 48
         self._program: list[int] = []  # register of the heartbeat, then one register per joint
+        self._wait: tuple[int, int] | None = None  # heartbeats that begin the motion, while it has not begun
         self._beat: int | None = None
         self._beat_s = self._device_s = 0.0
-        self._watchdog_s = math.inf
+        self._watchdog_s = self._patience_s = math.inf
         self._scripts: dict[Peer, bytes] = {}
 
     @property
@@ -186,10 +190,14 @@ class UrEmulator(WireEmulator):
                 self._registers[int(name.rsplit("_", 1)[1])] = value
         if self.runtime != PLAYING or not self._program:
             return
+        self._follow()
+
+    def _follow(self) -> None:
+        """Servo to the registers when the heartbeat has changed and, at first, is one that begins the motion."""
         beat = self._registers[self._program[0]]
-        if beat == self._beat:
+        if beat == self._beat or (self._wait is not None and not self._wait[0] < beat <= self._wait[1]):
             return
-        self._beat, self._beat_s = beat, self._device_s
+        self._wait, self._beat, self._beat_s = None, beat, self._device_s
         goal = np.array([self._registers[i] for i in self._program[1:]]) * 1e-6
         self._backing.command_position(goal, deadline=self.deadline())
 
@@ -199,8 +207,13 @@ class UrEmulator(WireEmulator):
             if "\nend\n" not in text:
                 return
             self._scripts[peer] = b""
-            cycles = SILENT_CYCLES.search(text)
-            self._watchdog_s = int(cycles.group(1)) * CYCLE_S if cycles else math.inf
+            first, far, wait, silent = (
+                int(found.group(1)) if (found := pattern.search(text)) else None
+                for pattern in (FIRST_BEAT, FAR_BEATS, WAIT_CYCLES, SILENT_CYCLES)
+            )
+            self._wait = None if first is None or far is None else (first, first + far)
+            self._patience_s = math.inf if wait is None else wait * CYCLE_S
+            self._watchdog_s = math.inf if silent is None else silent * CYCLE_S
             self._start_program([int(number) for number in REGISTER.findall(text)])
         elif text.endswith("\n"):
             self._scripts[peer] = b""
@@ -213,9 +226,10 @@ class UrEmulator(WireEmulator):
         if len(joints) != len(self._backing.capabilities().links) or self.safety_mode != NORMAL:
             return
         self._program = [registers[0], *joints]
-        self._beat, self._beat_s = self._registers[registers[0]], float("inf")
+        self._beat, self._beat_s = None if self._wait else self._registers[registers[0]], self._device_s
         self._backing.enable(deadline=self.deadline())
         self.runtime = PLAYING
+        self._follow()
 
     def _end_program(self) -> None:
         self._program, self.runtime = [], STOPPED
@@ -245,7 +259,8 @@ class UrEmulator(WireEmulator):
         """Check the program's watchdog, then send one data package to each client."""
         sample = self._backing.read_state(deadline=self.deadline())
         self._device_s = time_of(sample)
-        if self.runtime == PLAYING and self._device_s - self._beat_s > self._watchdog_s:
+        limit_s = self._watchdog_s if self._wait is None else self._patience_s
+        if self.runtime == PLAYING and self._device_s - self._beat_s > limit_s:
             self._end_program()
         values = self._values(sample.value)
         for peer in list(self._streams):

@@ -17,7 +17,11 @@ from hal.errors import InvalidRequest, MotionRefused
 from hal.strict import Strict
 
 Positive = Annotated[float, Field(gt=0)]
-STEP_MARGIN = 3.0  # set-points arrive in bunches on a busy host; jumps of more periods than this are clipped
+RATE_MARGIN = 1.1  # travel granted per second, as a multiple of the speed limit: set-points do not arrive evenly
+BURST_S, BURST_PERIODS = (
+    0.04,
+    1.5,
+)  # travel at the speed limit that may be saved up; with the margin 1.5 times the limit
 
 
 class LinkOptions(Strict):
@@ -123,6 +127,11 @@ def capabilities(
 class SetPointFilter:
     """Final check of set-points: shape, finite values, limits, and no jump from the previous one.
 
+    Each joint has a travel budget, in seconds at its speed limit. It grows with the time between set-points, by
+    `RATE_MARGIN` per second, up to `BURST_S` (more for an arm with slow set-points), and each set-point spends what it
+    travels. So in any time T a joint is sent at most `BURST_S + RATE_MARGIN T` seconds of travel at its speed limit, in
+    0.1 s 1.5 times the limit, however the set-points arrive. A pause saves up no more than `BURST_S`.
+
     Any thread may close the filter, for example after a stop or a lost link, while the control thread is processing a
     set-point or enabling the drives.
     """
@@ -132,8 +141,10 @@ class SetPointFilter:
         self._lower, self._upper = np.array(k.lower_rad), np.array(k.upper_rad)
         self._velocity = np.array(k.velocity_rad_per_s)
         self._period_s = 1.0 / command_rate_hz
+        self._burst_s = max(BURST_S, BURST_PERIODS * self._period_s)
+        self._budget_s: Array = np.zeros_like(self._lower)
         self._last: Array | None = None
-        self._last_s = 0.0
+        self._last_s: float | None = None
         self._closings = 0
         self._passing = threading.Lock()
 
@@ -162,7 +173,7 @@ class SetPointFilter:
         """
         with self._passing:
             self.check_not_closed_since(closings)
-            self._last = measured_rad
+            self._last, self._last_s = measured_rad, None
 
     def close(self) -> None:
         """Reject all set-points, including those of an enabling in progress."""
@@ -191,9 +202,18 @@ class SetPointFilter:
         with self._passing:
             if self._last is None:
                 raise MotionRefused(f"{self._name}: the drives are off", hint="call enable first", device=self._name)
-            elapsed_s = min(max(now_s - self._last_s, self._period_s), 10.0 * self._period_s)
-            step = self._velocity * elapsed_s * STEP_MARGIN
-            near = np.clip(wanted, self._last - step, self._last + step)
-            sent: Array = np.clip(near, self._lower, self._upper)
-            self._last, self._last_s = sent, now_s
+            budget_s = self._granted_s(now_s)
+            step = self._velocity * budget_s
+            allowed = np.clip(wanted, self._lower, self._upper)
+            sent: Array = np.clip(allowed, self._last - step, self._last + step)  # last: nor may a limit make it jump
+            self._budget_s = np.maximum(budget_s - np.abs(sent - self._last) / self._velocity, 0.0)
+            self._last, self._last_s = sent, now_s if self._last_s is None else max(now_s, self._last_s)
             return sent
+
+    def _granted_s(self, now_s: float) -> Array:
+        """Return the travel that each joint may be sent now; the first set-point after enabling may travel one period."""
+        if self._last_s is None:
+            return np.full_like(self._lower, RATE_MARGIN * self._period_s)
+        elapsed_s = max(0.0, now_s - self._last_s)
+        granted: Array = np.minimum(self._budget_s + RATE_MARGIN * elapsed_s, self._burst_s)
+        return granted

@@ -22,6 +22,7 @@ from drivers.transport.socket_link import open_tcp
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
 from drivers.ur import rtde
+from drivers.ur.program import BEATS, FAR_BEATS, FIRST_REGISTER, JOINTS, RAD_PER_COUNT, servo_program
 from drivers.ur.session import ANSWER_S, RtdeSession
 from hal.arrays import Array
 from hal.clock import Deadline, WallClock
@@ -31,13 +32,9 @@ from hal.readings import Stamped
 from hal.registry import Context, takes
 
 OUTPUTS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state")
-FIRST_REGISTER = 24  # 0-23 are reserved for fieldbuses
-JOINTS = 6
 INPUTS = tuple(f"input_int_register_{FIRST_REGISTER + i}" for i in range(JOINTS + 1))
-RAD_PER_COUNT = 1e-6
 RUNNING, PLAYING = 7, 2
 SAFE_MODES = (1, 2)  # normal, reduced
-CONTROL_RATE_HZ = 500  # of the controller, whatever the RTDE rate
 PROGRAM_START_S = 1.0
 MOVING_RAD_PER_S = 1e-3
 
@@ -90,27 +87,6 @@ class Modes:
     runtime: int
 
 
-def servo_program(options: UrOptions) -> str:
-    """Return the URScript program that follows the registers and brakes when the heartbeat stops."""
-    cycles = round(options.watchdog_s * CONTROL_RATE_HZ)
-    joints = ", ".join(f"read_input_integer_register({FIRST_REGISTER + 1 + i})*{RAD_PER_COUNT}" for i in range(JOINTS))
-    beat = f"read_input_integer_register({FIRST_REGISTER})"
-    return (
-        "def panelwright_servo():\n"
-        f"  last = {beat}\n"
-        f"  while {beat} == last:\n    sync()\n  end\n"
-        "  silent = 0\n"
-        f"  while silent < {cycles}:\n"
-        f"    beat = {beat}\n"
-        "    if beat == last:\n      silent = silent + 1\n    else:\n      silent = 0\n    end\n"
-        "    last = beat\n"
-        f"    servoj([{joints}], t=0.002, lookahead_time={options.lookahead_s}, gain={options.servo_gain})\n"
-        "  end\n"
-        f"  stopj({options.brake_rad_per_s2})\n"
-        "end\n"
-    )
-
-
 class Ur(StreamDevice[JointState]):
     """Universal Robots arm."""
 
@@ -127,7 +103,7 @@ class Ur(StreamDevice[JointState]):
         self._modes = Modes(robot=0, safety=0, runtime=0)
         self._was_playing = False
         self._enabled_s = 0.0
-        self._beat = 0
+        self._beat = int(1e3 * now_s()) % BEATS  # not where another session's heartbeat ended
         self._script: Link | None = None
         self._scripting = threading.Lock()  # one thread at a time on the script port
         self._commands = threading.Lock()
@@ -153,15 +129,25 @@ class Ur(StreamDevice[JointState]):
         measured = self.newest(deadline).value.position_rad
         self._require_healthy()
         with self._commands:
-            self._beat += 1
+            self._beat = (self._beat + FAR_BEATS) % BEATS
             self._send_registers(measured, deadline)  # first, so that the program starts at the arm's position
-            self._run_script(servo_program(self._options), deadline)
+            self._run_script(self._program(), deadline)
             self._was_playing, self._enabled_s = False, now_s()
             try:
                 self._filter.begin(measured, closings=closings)
             except MotionRefused:
                 self._brake(deadline)  # the program may have arrived after the stop itself
                 raise
+
+    def _program(self) -> str:
+        o = self._options
+        return servo_program(
+            first_beat=self._beat,
+            watchdog_s=o.watchdog_s,
+            lookahead_s=o.lookahead_s,
+            gain=o.servo_gain,
+            brake_rad_per_s2=o.brake_rad_per_s2,
+        )
 
     def command_position(self, position_rad: Array, *, deadline: Deadline) -> Array:
         """Write one set-point and the next heartbeat into the registers."""
@@ -217,7 +203,7 @@ class Ur(StreamDevice[JointState]):
             JointState(
                 position_rad=np.array(values["actual_q"]),
                 velocity_rad_per_s=velocity,
-                is_enabled=self._filter.is_open and self._is_healthy(),
+                is_enabled=self._filter.is_open and self._is_healthy() and not self._has_ended(),
                 is_moving=bool(np.any(np.abs(velocity) > MOVING_RAD_PER_S)),
             ),
             valid_s=self._host.host_s(device_s=device_s, arrived_s=arrived_s),
@@ -251,11 +237,15 @@ class Ur(StreamDevice[JointState]):
                 device=self.name,
             )
 
+    def _has_ended(self) -> bool:
+        """Return whether the program was seen running and runs no more."""
+        return self._was_playing and self._modes.runtime != PLAYING
+
     def _require_program(self) -> None:
         if self._modes.runtime == PLAYING:
             return
-        if self._was_playing:
-            what, hint = "has ended (watchdog or pendant)", "enable again"
+        if self._has_ended():
+            what, hint = "has ended (watchdog or pendant)", "enable again, and send set-points without a pause"
         elif now_s() - self._enabled_s > self.patience * PROGRAM_START_S:
             what, hint = "does not start", "set the robot to remote control"
         else:
@@ -269,7 +259,7 @@ class Ur(StreamDevice[JointState]):
             if link is None or inputs is None:
                 raise LinkLost("the RTDE connection is down")
             counts = [round(q / RAD_PER_COUNT) for q in position_rad]
-            link.write(inputs.pack([self._beat % 2**31, *counts]), wall_until(deadline))
+            link.write(inputs.pack([self._beat, *counts]), wall_until(deadline))
         except WireError as error:
             raise self.translate(error) from error
 

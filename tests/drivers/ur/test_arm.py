@@ -137,6 +137,44 @@ def test_enabling_alone_moves_nothing_and_waits_for_the_first_set_point() -> Non
         np.testing.assert_array_equal(arm.position_rad, before)
 
 
+def test_a_pause_after_the_set_point_that_follows_enabling_at_once_ends_the_program() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        device.enable(deadline=soon())
+        device.command_position(arm.position_rad, deadline=soon())
+        until(lambda: far_side.runtime == emulator.PLAYING)
+        until(lambda: far_side.runtime == emulator.STOPPED)
+        assert arm.stops == 1
+        until(lambda: not device.read_state(deadline=soon()).value.is_enabled)
+        with pytest.raises(MotionRefused, match="has ended"):
+            device.command_position(arm.position_rad, deadline=soon())
+
+
+def test_enabling_without_a_set_point_ends_the_program() -> None:
+    arm = ScriptedArm()
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        device.enable(deadline=soon())
+        until(lambda: far_side.runtime == emulator.PLAYING)
+        until(lambda: far_side.runtime == emulator.STOPPED)
+        assert (arm.commands, arm.stops) == (0, 1)
+        until(lambda: not device.read_state(deadline=soon()).value.is_enabled)
+        with pytest.raises(MotionRefused, match="has ended"):
+            device.command_position(arm.position_rad, deadline=soon())
+
+
+@pytest.mark.parametrize("old_beat", [-5, 0, 7, 2**31 - 1])
+def test_the_set_point_that_an_older_session_left_in_the_registers_moves_nothing(old_beat: int) -> None:
+    arm = ScriptedArm()
+    far_side = emulator.start(arm, {})
+    far_side._registers[24:31] = [old_beat, *[500_000] * 6]
+    with wired(far_side, DRIVER) as device:
+        device._beat = 10
+        device._run_script(device._program(), soon())  # it starts before the first registers arrive
+        until(lambda: far_side.runtime == emulator.PLAYING)
+        device.newest(soon(), not_before_s=soon(0.1).at_s)
+        assert arm.commands == 0
+
+
 def test_a_protective_stop_ends_motion_and_a_person_must_see_to_it() -> None:
     arm = ScriptedArm()
     with wired(far_side := emulator.start(arm, {}), DRIVER) as device:

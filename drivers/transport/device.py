@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from drivers.transport.link import LinkLost, RecordingEnded, Refused, now_s
 from drivers.transport.mailbox import Mailbox
 from drivers.transport.port import Port
-from hal.clock import Deadline, PacedClock
+from hal.clock import Deadline, PacedClock, WallClock
 from hal.devices import DeviceKind, Health
 from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
@@ -25,6 +25,7 @@ BYTES_WITHOUT_SENSE = (
 SLICE_S = 0.02  # longest wait of a stream reader, so that close() returns soon
 CONNECT_S = 3.0  # a set-up whose first answers are lost needs several attempts
 REFUSED_S = 1.0  # a port that cannot be opened for this long counts as absent
+CLOCK_READINGS = 3
 PATIENCE = 6.0  # factor on time limits beside an emulator, which a busy machine delays as much as us
 
 
@@ -60,6 +61,7 @@ class WireDevice(Generic[T]):
         self.mailbox: Mailbox[T] = Mailbox()
         self.errors = 0
         self._sequence = 0
+        self._last_stamps: tuple[float, float | None] = (-math.inf, None)  # of the newest sample: host, device
         self._is_closed = False
         self._state = threading.Lock()
         self._last_error = "not connected yet"
@@ -81,16 +83,27 @@ class WireDevice(Generic[T]):
     ) -> None:
         """Publish a new sample to all readers.
 
+        Stamps rise from sample to sample. Where a better estimate of the device's clock would set one back, it is set just
+        after the one before: the sample is younger than that one, so its stamp is closer to the truth than that one's
+        was. A sample that the device took no later than the one before is dropped.
+
         Args:
             valid_s: when the value was valid, on the links' clock.
             missed: samples known to be lost just before this one; the sequence number skips them.
         """
+        host_time_s, (last_s, last_device_s) = self._on_cell_clock(valid_s), self._last_stamps
+        if host_time_s <= last_s:
+            if device_time_s is not None and last_device_s is not None and device_time_s <= last_device_s:
+                self.errors += 1
+                return
+            host_time_s = math.nextafter(last_s, math.inf)
+        self._last_stamps = (host_time_s, device_time_s)
         self._sequence += 1 + missed
         self.errors += missed
         self.mailbox.publish(
             Stamped(
                 value=value,
-                host_time_s=self._on_cell_clock(valid_s),
+                host_time_s=host_time_s,
                 sequence=self._sequence,
                 device_time_s=device_time_s,
                 quality=quality,
@@ -100,9 +113,15 @@ class WireDevice(Generic[T]):
 
     def _on_cell_clock(self, valid_s: float) -> float:
         clock = self.context.clock
+        if isinstance(clock, WallClock):
+            return valid_s  # the links' clock
         if self.is_emulated and isinstance(clock, PacedClock):
             return clock.at_s(valid_s)
-        return clock.now_s() - (now_s() - valid_s)
+        readings = []
+        for _ in range(CLOCK_READINGS):  # a thread switch between the two clocks would shift the stamp by its length
+            before_s, cell_s, after_s = now_s(), clock.now_s(), now_s()
+            readings.append((after_s - before_s, cell_s - after_s))
+        return valid_s + min(readings)[1]
 
     def newest(self, deadline: Deadline, *, not_before_s: float | None = None) -> Stamped[T]:
         """Return the newest sample, at most `max_age_s` old; wait for one until the deadline.

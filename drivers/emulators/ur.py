@@ -33,6 +33,7 @@ OUTPUT_TYPES = {
     "safety_mode": "INT32",
     "runtime_state": "UINT32",
     "speed_scaling": "DOUBLE",
+    **{f"input_int_register_{i}": "INT32" for i in range(48)},
 }
 INPUT_TYPES = {
     "speed_slider_mask": "UINT32",
@@ -80,6 +81,10 @@ class UrPorts:
     def dashboard_port(self) -> int:
         """Return the port number of the dashboard."""
         return int(self._ports["dashboard"].address["port"])
+
+    def rtde_peers(self) -> tuple[Peer, ...]:
+        """Return the open RTDE connections."""
+        return self._ports["rtde"].peers
 
     def receive(self, timeout_s: float) -> list[tuple[Peer, bytes]]:
         """Return what the three ports have received; only the RTDE port waits."""
@@ -157,8 +162,12 @@ class UrEmulator(WireEmulator):
                 self.reply(peer, self._dashboard(line.strip()).encode() + b"\n")
 
     def _forget(self, peer: Peer) -> None:
-        self._parsers.pop(peer, None)
-        self._streams.discard(peer)
+        """Forget connections that have ended; `peer` is a new one, whose socket may be that of an old one."""
+        gone = {*self._parsers, *self._inputs} - {("rtde", sock) for sock in self.ports.rtde_peers()} | {peer}
+        for each in gone:
+            self._parsers.pop(each, None)
+            self._inputs.pop(each, None)
+            self._streams.discard(each)
 
     def _rtde(self, peer: Peer, kind: str, payload: bytes) -> None:
         match kind:
@@ -180,7 +189,10 @@ class UrEmulator(WireEmulator):
         self, peer: Peer, kind: str, names: tuple[str, ...], known: dict[str, str], recipes: dict[Peer, rtde.Recipe]
     ) -> None:
         types = [known.get(name, "NOT_FOUND") for name in names]
-        if "NOT_FOUND" not in types:
+        if kind == "I":  # an input belongs to the client that asked for it first, until it disconnects
+            taken = {name for other in self._inputs if other != peer for name in self._inputs[other].names}
+            types = [rtde.IN_USE if name in taken else type_ for name, type_ in zip(names, types, strict=True)]
+        if not {"NOT_FOUND", rtde.IN_USE} & set(types):
             recipes[peer] = rtde.recipe(1, names, types)
         self.reply(peer, rtde.package(kind, bytes([1]) + ",".join(types).encode()))
 
@@ -283,6 +295,7 @@ class UrEmulator(WireEmulator):
             "safety_mode": [self.safety_mode],
             "runtime_state": [self.runtime],
             "speed_scaling": [1.0],
+            **{f"input_int_register_{i}": [value] for i, value in enumerate(self._registers)},
         }
 
     def _data(self, peer: Peer, values: dict[str, list[float]]) -> bytes:

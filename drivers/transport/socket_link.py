@@ -18,6 +18,19 @@ class SocketLink(FdLink):
         super().__init__(sock.fileno(), name)
         self._sock = sock
 
+    @property
+    def addresses(self) -> tuple[tuple[str, int], tuple[str, int]]:
+        """Return host and port of this end, then those of the other end.
+
+        Raises:
+            LinkLost: the connection has been lost.
+        """
+        try:
+            ours, theirs = self._sock.getsockname(), self._sock.getpeername()
+        except OSError as error:
+            raise LinkLost(f"{self.name}: {error}") from error
+        return (str(ours[0]), int(ours[1])), (str(theirs[0]), int(theirs[1]))
+
     def _release(self, fd: int) -> None:  # noqa: ARG002  # the socket closes it
         self._sock.close()
 

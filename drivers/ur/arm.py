@@ -15,15 +15,17 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from drivers.kinds.arms import KinematicsOptions, SetPointFilter, capabilities, ur10e
-from drivers.transport.device import wall_until
+from drivers.transport.capture import inside
+from drivers.transport.device import SLICE_S, wall_until
 from drivers.transport.link import Link, LinkLost, WireError, drain, now_s
 from drivers.transport.options import CONNECT_TIMEOUT_S, PortNumber, read_options, tcp_opener
-from drivers.transport.socket_link import open_tcp
+from drivers.transport.socket_link import SocketLink, open_tcp
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
 from drivers.ur import rtde
+from drivers.ur.ownership import MARKS, Ownership, marks, owner_by_marks
 from drivers.ur.program import BEATS, FAR_BEATS, FIRST_REGISTER, JOINTS, RAD_PER_COUNT, servo_program
-from drivers.ur.session import ANSWER_S, RtdeSession
+from drivers.ur.session import ANSWER_S, InUse, RtdeSession
 from hal.arrays import Array
 from hal.clock import Deadline, WallClock
 from hal.devices import ArmCapabilities, DeviceKind, JointState
@@ -32,7 +34,7 @@ from hal.readings import Stamped
 from hal.registry import Context, takes
 
 OUTPUTS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state")
-INPUTS = tuple(f"input_int_register_{FIRST_REGISTER + i}" for i in range(JOINTS + 1))
+INPUTS = (*(f"input_int_register_{FIRST_REGISTER + i}" for i in range(JOINTS + 1)), *MARKS)
 RUNNING, PLAYING = 7, 2
 SAFE_MODES = (1, 2)  # normal, reduced
 PROGRAM_START_S = 1.0
@@ -98,6 +100,9 @@ class Ur(StreamDevice[JointState]):
         self._options = options
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
         self._session = RtdeSession(answer_s=self.patience * ANSWER_S)
+        self._ownership = Ownership(context, options.owns[0])
+        self._marks = (0, 0)
+        self._is_marked = False
         self._host = HostTime()
         self._last_device_s = 0.0
         self._modes = Modes(robot=0, safety=0, runtime=0)
@@ -170,9 +175,25 @@ class Ur(StreamDevice[JointState]):
         self._run_script(f"stopj({self._options.brake_rad_per_s2})\n", deadline)
 
     def start(self, link: Link) -> None:
-        """Set up recipes and start the stream; motion stays disabled."""
+        """Take the arm, set up recipes and start the stream; motion stays disabled.
+
+        Raises:
+            DeviceUnavailable: another process or another client of the controller has the arm.
+        """
         self._filter.close()
-        self._session.begin(link, outputs=OUTPUTS, rate_hz=self._options.rate_hz, inputs=INPUTS)
+        connection = inside(link, SocketLink)
+        if connection is not None:  # else a replay
+            self._ownership.take(connection)
+            self._marks = marks(connection)
+        try:
+            self._session.begin(link, outputs=OUTPUTS, rate_hz=self._options.rate_hz, inputs=INPUTS)
+        except InUse:
+            if connection is None:
+                raise
+            _, (host, port) = connection.addresses
+            owner = owner_by_marks(host, port, answer_s=self.patience * ANSWER_S, device=self.name)
+            raise self._ownership.refusal(host, port, owner) from None
+        self._is_marked = False
         self._host.reset()
         self._last_device_s = 0.0
 
@@ -211,6 +232,21 @@ class Ur(StreamDevice[JointState]):
             missed=max(0, steps - 1) if steps < 100 else 0,
         )
 
+        if not self._is_marked and self._modes.runtime != PLAYING:  # a program that still runs reads the registers
+            self._mark(np.array(values["actual_q"]))
+
+    def _mark(self, measured_rad: Array) -> None:
+        """Name this process to other clients of the controller."""
+        link, inputs = self.port.link, self._session.inputs
+        if link is None or inputs is None or not self._commands.acquire(blocking=False):
+            return
+        try:
+            with suppress(WireError):
+                link.write(self._registers(inputs, measured_rad), now_s() + SLICE_S)
+                self._is_marked = True
+        finally:
+            self._commands.release()
+
     def lost(self, error: Exception) -> None:
         """Stop the motion and report the loss of the link."""
         self._filter.close()
@@ -224,6 +260,7 @@ class Ur(StreamDevice[JointState]):
                 self._brake(Deadline.after(WallClock(), 0.05))
         super().release()
         self._close_script()
+        self._ownership.release()
 
     def _is_healthy(self) -> bool:
         return self._modes.robot == RUNNING and self._modes.safety in SAFE_MODES
@@ -258,10 +295,14 @@ class Ur(StreamDevice[JointState]):
         try:
             if link is None or inputs is None:
                 raise LinkLost("the RTDE connection is down")
-            counts = [round(q / RAD_PER_COUNT) for q in position_rad]
-            link.write(inputs.pack([self._beat, *counts]), wall_until(deadline))
+            link.write(self._registers(inputs, position_rad), wall_until(deadline))
         except WireError as error:
             raise self.translate(error) from error
+        self._is_marked = True
+
+    def _registers(self, inputs: rtde.Recipe, position_rad: Array) -> bytes:
+        counts = [round(q / RAD_PER_COUNT) for q in position_rad]
+        return inputs.pack([self._beat, *counts, *self._marks])
 
     def _run_script(self, text: str, deadline: Deadline) -> None:
         until_s = wall_until(deadline)

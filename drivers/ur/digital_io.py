@@ -16,12 +16,15 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import Field, model_validator
 
 from drivers.kinds.digital_points import require_same_number, wanted_lights
+from drivers.transport.capture import inside
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, LinkLost, WireError, now_s
 from drivers.transport.options import Seconds, read_options, tcp_opener
+from drivers.transport.socket_link import SocketLink
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import HostTime
 from drivers.ur import rtde
+from drivers.ur.ownership import Ownership
 from drivers.ur.session import ANSWER_S, RtdeSession
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, TouchCapabilities
@@ -130,6 +133,7 @@ class UrLights(UrIo):
         self._wanted: Bits | None = None
         self._commanded_s = -math.inf
         self._writing = threading.Lock()
+        self._ownership = Ownership(context, options.owns[0])
 
     def capabilities(self) -> LightsCapabilities:
         """Return the channel names given by the options."""
@@ -160,7 +164,14 @@ class UrLights(UrIo):
         return self.newest(deadline, not_before_s=max(oldest_s, self._commanded_s))
 
     def start(self, link: Link) -> None:
-        """Restore the last commanded state of the lights after a loss."""
+        """Take the outputs, and restore the last commanded state of the lights after a loss.
+
+        Raises:
+            DeviceUnavailable: another process of this machine has the outputs.
+        """
+        connection = inside(link, SocketLink)
+        if connection is not None:  # else a replay
+            self._ownership.take(connection)
         super().start(link)
         if self._wanted is not None:
             self._switch(link, self._wanted, now_s() + ANSWER_S)
@@ -179,6 +190,7 @@ class UrLights(UrIo):
             with suppress(WireError):
                 self._switch(link, (False,) * len(self._options.outputs), now_s() + CLOSE_S)
         super().release()
+        self._ownership.release()
 
     def _switch(self, link: Link, wanted: Bits, until_s: float) -> None:
         orders = self._session.inputs

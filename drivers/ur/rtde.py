@@ -24,7 +24,8 @@ TYPES = {
 }
 KNOWN = frozenset(b"VvOIUSPM")
 LONGEST = 4096
-REFUSALS = {"NOT_FOUND": "is not known to this controller", "IN_USE": "is taken by another client"}
+IN_USE = "IN_USE"
+REFUSALS = {"NOT_FOUND": "is not known to this controller", IN_USE: "is taken by another client"}
 
 
 class RtdeOptions(TcpOptions):
@@ -39,7 +40,11 @@ class RtdeOptions(TcpOptions):
 
 
 class RecipeRefused(ValueError):
-    """The controller does not have a variable, or another client owns it."""
+    """The controller does not have a variable."""
+
+
+class VariableInUse(RecipeRefused):
+    """Another client owns an input variable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +73,12 @@ def recipe(id_: int, names: Sequence[str], types: Sequence[str]) -> Recipe:
     """Return a recipe as confirmed by the controller.
 
     Raises:
-        RecipeRefused: a variable is NOT_FOUND or IN_USE.
+        RecipeRefused: a variable is NOT_FOUND or IN_USE (`VariableInUse`).
     """
     for name, kind in zip(names, types, strict=True):
         if kind not in TYPES:
-            raise RecipeRefused(f"{name} {REFUSALS.get(kind, f'has the unknown type {kind}')}")
+            refusal = VariableInUse if kind == IN_USE else RecipeRefused
+            raise refusal(f"{name} {REFUSALS.get(kind, f'has the unknown type {kind}')}")
     codes = [TYPES[kind] for kind in types]
     widths = tuple(int(code[:-1] or 1) for code in codes)
     return Recipe(id_, tuple(names), struct.Struct(">" + "".join(codes)), widths)

@@ -13,6 +13,10 @@ ANSWER_S = 0.5
 PLAUSIBLE = {"timestamp": (0.0, 1e9), "robot_mode": (-1, 255), "safety_mode": (0, 255), "runtime_state": (0, 255)}
 
 
+class InUse(Refused):
+    """Another client of the controller owns an input that this one asks for."""
+
+
 class RtdeSession:
     """Sets up the recipes on a new link and decodes its bytes into values.
 
@@ -38,7 +42,8 @@ class RtdeSession:
                 that follows them in the package, so preferably one of `PLAUSIBLE` is last.
 
         Raises:
-            Refused: another version, or a variable that the controller does not provide. NoAnswer, LinkLost.
+            Refused: another version, or a variable that the controller does not provide. InUse: another client owns one of
+                `inputs`. NoAnswer, LinkLost.
         """
         self._parser, self._last_s = rtde.PackageParser(), -math.inf
         if self._ask(link, rtde.package("V", b"\x00\x02"), "V")[:1] != b"\x01":
@@ -68,6 +73,10 @@ class RtdeSession:
         answer = self._ask(link, request, kind)
         try:
             return rtde.recipe(answer[0], names, rtde.split_names(answer[1:]))
+        except rtde.VariableInUse as error:
+            raise InUse(
+                f"recipe refused: {error}", code=0, hint="only one client may own it: end the other one"
+            ) from None
         except (rtde.RecipeRefused, ValueError, IndexError) as error:
             raise Refused(f"recipe refused: {error}", code=0) from None
 

@@ -165,9 +165,9 @@ def test_enabling_without_a_set_point_ends_the_program() -> None:
 @pytest.mark.parametrize("old_beat", [-5, 0, 7, 2**31 - 1])
 def test_the_set_point_that_an_older_session_left_in_the_registers_moves_nothing(old_beat: int) -> None:
     arm = ScriptedArm()
-    far_side = emulator.start(arm, {})
-    far_side._registers[24:31] = [old_beat, *[500_000] * 6]
-    with wired(far_side, DRIVER) as device:
+    with wired(far_side := emulator.start(arm, {}), DRIVER) as device:
+        until(lambda: device._is_marked and far_side._registers[32] != 0)
+        far_side._registers[24:31] = [old_beat, *[500_000] * 6]
         device._beat = 10
         device._run_script(device._program(), soon())  # it starts before the first registers arrive
         until(lambda: far_side.runtime == emulator.PLAYING)

@@ -47,6 +47,7 @@ def _app() -> Callable[[], None]:
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
+    from service.commands.drivers import drivers
     from service.commands.init import init
     from service.commands.journal import journal
     from service.commands.learn import learn
@@ -69,6 +70,7 @@ def _app() -> Callable[[], None]:
     app.command()(demo)
     app.command()(doctor)
     app.add_typer(devices.app, name="devices")
+    app.command()(drivers)
     app.add_typer(tasks.app, name="task")
     app.command()(tasks.stop)
     app.command()(journal)

@@ -47,6 +47,11 @@ class KinematicsOptions(Strict):
     tip_speed_m_per_s: Annotated[Positive, Field(description="largest speed of the flange")]
     link_radius_m: Annotated[tuple[Positive, ...], Field(description="radius of each link for collision checks")]
 
+    @classmethod
+    def example(cls) -> dict[str, Any]:
+        """Return the table of a UR10e, which the option reference shows."""
+        return ur10e().model_dump(mode="json")
+
     @model_validator(mode="after")
     def _one_entry_a_joint(self) -> Self:
         lists = (self.links, self.lower_rad, self.upper_rad, self.velocity_rad_per_s, self.acceleration_rad_per_s2)

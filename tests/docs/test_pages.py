@@ -14,7 +14,7 @@ from hal.config import load_cell
 from hal.panel import PanelObject, load_panel
 from hal.panel.kinds import KINDS
 from service.cli import _app
-from tests.docs import commands_page
+from tests.docs import commands_page, driver_pages
 from tests.docs.blocks import PAGES, ROOT, page_name
 
 LINK = re.compile(r"\[[^\]]*\]\(([^)#]+)(?:#[^)]*)?\)")
@@ -61,6 +61,13 @@ def test_every_command_that_the_pages_name_exists() -> None:
 def test_the_page_of_commands_is_what_the_commands_say() -> None:
     written = commands_page.PAGE.read_text(encoding="utf-8")
     assert written == commands_page.text(), "run: python -m tests.docs.commands_page"
+
+
+def test_the_options_and_the_table_of_drivers_are_what_models_and_records_say() -> None:
+    remedy = "run: python -m tests.docs.driver_pages"
+    assert driver_pages.OPTIONS.read_text(encoding="utf-8") == driver_pages.options_text(), remedy
+    page = driver_pages.DRIVERS.read_text(encoding="utf-8")
+    assert page == driver_pages.drivers_text(page), remedy
 
 
 def test_every_page_is_in_the_site_and_every_entry_is_a_page() -> None:

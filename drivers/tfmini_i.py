@@ -12,7 +12,8 @@ from pydantic import Field
 
 from drivers.tfmini import EchoOptions
 from drivers.transport.bus import PolledDevice
-from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
+from drivers.transport.can_frames import CanFrame, FrameReader
+from drivers.transport.canbus import CanOptions, can_opener
 from drivers.transport.link import Link, now_s
 from drivers.transport.modbus import ModbusMaster
 from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
@@ -28,7 +29,6 @@ READING_REGISTER, FIRMWARE_REGISTER = 0, 6
 CM = 0.01
 STAMP_BITS, STAMP_S = 32, 0.001
 WITH_CLOCK_BYTES, WITHOUT_CLOCK_BYTES = 8, 6
-OPEN_S = 0.2
 
 
 class ModbusTfminiOptions(ModbusOptions, EchoOptions):
@@ -39,8 +39,7 @@ class CanTfminiOptions(CanOptions, EchoOptions):
     """Options of `can:tfmini`; `id` is the CAN identifier of the sensor. The manual does not state the byte order."""
 
     bitrate: Annotated[
-        Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000],
-        Field(description="bit rate of the bus, bit/s; a TF03 has 1000000"),
+        int, Field(ge=5_000, le=1_000_000, description="bit rate of the bus, bit/s; a TF03 has 1000000")
     ] = 250_000
     id: Annotated[int, Field(ge=0, le=0x7FF, description="CAN identifier of the sensor's frames")] = 3
     byte_order: Annotated[
@@ -124,11 +123,10 @@ class CanTfmini(StreamDevice[float]):
     kind = DeviceKind.PROXIMITY
 
     def __init__(self, context: Context, options: CanTfminiOptions) -> None:
-        opener, codec, name = can_opener(options, context.name)
+        opener, name = can_opener(options, context.name)
         super().__init__(context, open_link=opener, link_name=name, max_age_s=max(3.0 / options.rate_hz, 0.05))
         self._options = options
-        self._make_codec = codec
-        self._codec: CanCodec = codec()
+        self._frames = FrameReader()
         self._clock = SensorClock()
         self._times = FrameTimes(period_s=1.0 / options.rate_hz, frame_bytes=0)  # the adapter has another byte time
         order = "<" if options.byte_order == "little" else ">"
@@ -142,21 +140,20 @@ class CanTfmini(StreamDevice[float]):
         """Return the newest distance; invalid and NaN when the echo is too weak or out of range."""
         return self.newest(deadline)
 
-    def start(self, link: Link) -> None:
-        """Open the channel; the sensor streams without being asked."""
-        self._codec = self._make_codec()
+    def start(self, link: Link) -> None:  # noqa: ARG002  # nothing is sent
+        """Start again with the clocks; the sensor streams without being asked."""
+        self._frames.reset()
         self._clock.reset()
         self._times.reset()
-        link.write(self._codec.opening(self._options.bitrate), now_s() + OPEN_S)
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each of the sensor's frames; frames of other nodes or of another length are ignored."""
-        for frame in self._codec.feed(chunk):
+        for frame in self._frames.feed(chunk, arrived_s):
             if frame.id == self._options.id:
-                self._take(frame, arrived_s)
+                self._take(frame)
 
-    def _take(self, frame: CanFrame, arrived_s: float) -> None:
-        device_s: float | None = None
+    def _take(self, frame: CanFrame) -> None:
+        device_s, arrived_s = None, frame.arrived_s
         if len(frame.data) == WITH_CLOCK_BYTES:
             raw, strength, stamp_ms = self._with_clock.unpack(frame.data)
             if not self._clock.is_new(stamp_ms):

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 
+from benchmarks.drivers.canbus import part_can
 from benchmarks.drivers.faults import part_faults
 from benchmarks.drivers.fuzz import part_fuzz
 from benchmarks.drivers.life import part_isolation, part_reconnect
@@ -21,6 +22,7 @@ PARTS: dict[str, Callable[[float], None]] = {
     "latency": part_latency,
     "rtu": part_rtu,
     "decode": part_decode,
+    "can": part_can,
     "stamps": part_stamps,
     "reconnect": part_reconnect,
     "swap": part_swap,

@@ -86,6 +86,15 @@ BENCHES = (
         faults=WITHOUT_CRC,
     ),
     Bench(
+        name="tfmini virtual can",
+        start=tfmini_i.start_can,
+        backing=scripted.ScriptedProximity,
+        driver="can:tfmini",
+        is_true=true_centimetres,
+        far_options={"transport": "virtual"},
+        faults=WITHOUT_CRC,
+    ),
+    Bench(
         name="ft300 stream",
         start=ft300.start,
         backing=TimedForceTorque,
@@ -196,6 +205,15 @@ BENCHES = (
         driver="can:cia402",
         taken_s=taken_s,
         is_true=true_joints,
+    ),
+    Bench(
+        name="cia402 virtual",
+        start=cia402.start,
+        backing=MovingArm,
+        driver="can:cia402",
+        taken_s=taken_s,
+        is_true=true_joints,
+        far_options={"transport": "virtual"},
     ),
     Bench(
         name="dynamixel",

@@ -11,8 +11,8 @@ from drivers import bota, ft300, lms200, scip, tfmini
 from drivers.dynamixel import protocol
 from drivers.rplidar.express import CapsuleParser
 from drivers.rplidar.scanner import NodeParser
-from drivers.transport.canbus import RawCan, Slcan
 from drivers.transport.framing import Framer
+from drivers.transport.slcan import LineReader
 from drivers.ur import rtde
 
 INPUTS = 1_000_000
@@ -37,8 +37,8 @@ def parsers() -> dict[str, tuple[Feed, bytes]]:
         "rplidar express": (CapsuleParser().feed, b"\xa5\x5a"),
         "scip": (lambda chunk: answers.feed(chunk, "MD"), b"MD0000\n99b\n"),
         "rtde": (rtde.PackageParser().feed, b"\x00\x10U"),
-        "slcan": (Slcan().feed, b"t1812"),
-        "can": (RawCan().feed, bytes(16)),
+        "slcan": (LineReader().feed, b"t1812"),
+        "slcan fd": (LineReader().feed, b"D181"),
         "false length": (lying.feed, b"\xaa"),
     }
 

@@ -25,7 +25,7 @@ CONTROL_S, EVENT_S = 0.002, 0.005
 def part_reconnect(seconds: float) -> None:  # noqa: ARG001  # a number of unplugs, however long they take
     """Measure the time from the port's return to the first valid sample, and leaks of descriptors and threads."""
     process = psutil.Process()
-    for name in ("tfmini", "modbus_io rtu", "scip tcp", "bota"):
+    for name in ("tfmini", "modbus_io rtu", "scip tcp", "bota", "cia402", "tfmini can"):
         back_s: list[float] = []
         with running(bench(name), {}) as (device, far_side, _):
             device.newest(deadline(2.0))
@@ -55,7 +55,9 @@ def part_isolation(seconds: float) -> None:
     This is done at ordinary priority, where a busy machine delays the loops anyway (the floor is the same loops without
     drivers), and at real-time priority.
     """
-    names = tuple(item.name for item in BENCHES)
+    names = tuple(
+        item.name for item in BENCHES if item.far_options.get("transport") != "virtual"
+    )  # in one process only
     for priority, word in PRIORITIES:
         with far_process(*names) as far, realtime(priority, far.pid) as is_given, ExitStack() as stack:
             if not is_given:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Self
 
@@ -20,7 +19,8 @@ from drivers.cia402.setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, u
 from drivers.cia402.states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
 from drivers.cia402.sync import SyncCount
 from drivers.kinds.arms import KinematicsOptions, SetPointFilter, capabilities, require_stations
-from drivers.transport.canbus import CanCodec, CanFrame, CanOptions, can_opener
+from drivers.transport.can_frames import CanFrame, FrameReader, record
+from drivers.transport.canbus import CanOptions, can_opener
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s
 from drivers.transport.options import read_options
@@ -110,7 +110,7 @@ class Cia402(StreamDevice[JointState]):
     kind = DeviceKind.ARM
 
     def __init__(self, context: Context, options: Cia402Options) -> None:
-        opener, codec, name = can_opener(options, context.name)
+        opener, name = can_opener(options, context.name)
         super().__init__(
             context,
             open_link=opener,
@@ -119,8 +119,7 @@ class Cia402(StreamDevice[JointState]):
             realtime_priority=options.realtime_priority,
         )
         self._options = options
-        self._make_codec: Callable[[], CanCodec] = codec
-        self._codec = codec()
+        self._frames = FrameReader()
         self._answer_s = self.patience * SDO_S
         self._rad = np.radians(options.degrees_per_increment)
         self._filter = SetPointFilter(context.name, options.kinematics, command_rate_hz=options.rate_hz)
@@ -196,11 +195,10 @@ class Cia402(StreamDevice[JointState]):
         """Open the channel, check and configure each drive, and start them; motion stays disabled."""
         o = self._options
         self._switch_off()
-        self._codec = self._make_codec()
-        link.write(self._codec.opening(o.bitrate), now_s() + self._answer_s)
+        self._frames.reset()
         drain(link)
         self._send(link, NMT, bytes([PRE_OPERATIONAL, 0]))
-        self._set_up.run(SdoClient(link, self._codec, answer_s=self._answer_s, restarted=self._set_up.forget))
+        self._set_up.run(SdoClient(link, answer_s=self._answer_s, restarted=self._set_up.forget))
         self._axes = {node: Axis() for node in o.nodes}
         self._syncs = self._published = 0
         self._odd = ""
@@ -208,7 +206,7 @@ class Cia402(StreamDevice[JointState]):
         self._started_s = self._next_sync_s = self._next_beat_s = now_s()
 
     def _send(self, link: Link, id_: int, data: bytes = b"") -> None:
-        link.write(self._codec.encode(CanFrame(id_, data)), now_s() + self._answer_s)
+        link.write(record(CanFrame(id_, data)), now_s() + self._answer_s)
 
     def keep_going(self, link: Link) -> float:
         """Send heartbeat, targets and SYNC when they are due; return the time until the next, in seconds."""
@@ -236,7 +234,7 @@ class Cia402(StreamDevice[JointState]):
         is_behind = any(axis.count.owed >= MOST_OWED or axis.count.needs_rest for axis in self._axes.values())
         # Further SYNCs would only queue up and make every answer older than the last.
         batch = probes if is_behind else [*probes, *frames, CanFrame(SYNC, b"")]
-        link.write(b"".join(self._codec.encode(frame) for frame in batch), now + self._answer_s)
+        link.write(b"".join(map(record, batch)), now + self._answer_s)
         if is_behind:
             self.held_syncs += 1
             return
@@ -261,7 +259,7 @@ class Cia402(StreamDevice[JointState]):
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Collect the states of one SYNC, and handle emergency messages and drive restarts."""
-        for frame in self._codec.feed(chunk):
+        for frame in self._frames.feed(chunk, arrived_s):
             node = frame.id & 0x7F
             axis = self._axes.get(node)
             if axis is None:
@@ -285,7 +283,7 @@ class Cia402(StreamDevice[JointState]):
                 case 0x080 if len(frame.data) == 8:
                     self._emergency(node, frame.data)
                 case 0x700 if len(frame.data) == 1:
-                    self._heard_beat(node, frame.data[0] & 0x7F, arrived_s)
+                    self._heard_beat(node, frame.data[0] & 0x7F, frame.arrived_s)
 
     def _heard_beat(self, node: int, state: int, arrived_s: float) -> None:
         """Handle a heartbeat: a drive that is not operational sends no PDOs, so there is no point in waiting for them."""

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
-from drivers.transport.canbus import CanCodec, CanFrame
+from drivers.transport.can_frames import CanFrame, record, records
 from drivers.transport.link import Link, NoAnswer, Refused, now_s
 
 SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x580, 0x600, 0x700
@@ -61,10 +61,9 @@ class SdoClient:
     """
 
     def __init__(
-        self, link: Link, codec: CanCodec, *, answer_s: float = SDO_S, restarted: Callable[[int], None] = lambda _: None
+        self, link: Link, *, answer_s: float = SDO_S, restarted: Callable[[int], None] = lambda _: None
     ) -> None:
         self._link = link
-        self._codec = codec
         self._answer_s = answer_s
         self._restarted = restarted
 
@@ -104,14 +103,14 @@ class SdoClient:
         raise NoAnswer(f"node {node} does not answer; is it powered, and is the bit rate right?")
 
     def _exchange(self, node: int, request: bytes, is_answer: Callable[[bytes], bool]) -> bytes | None:
-        self._link.write(self._codec.encode(CanFrame(SDO_REQUEST + node, request)), now_s() + self._answer_s)
+        self._link.write(record(CanFrame(SDO_REQUEST + node, request)), now_s() + self._answer_s)
         until_s, found = now_s() + self._answer_s, None
         while found is None and (chunk := self._link.read(until_s)):
-            for frame in self._codec.feed(chunk):
-                if frame.id & 0x780 == HEARTBEAT and frame.data == BOOT_UP:
-                    self._restarted(frame.id & 0x7F)
-                if frame.id == SDO_ANSWER + node and len(frame.data) == 8 and is_answer(frame.data):
-                    found = frame.data
+            for id_, data, _ in records(chunk):
+                if id_ & ~0x7F == HEARTBEAT and data == BOOT_UP:
+                    self._restarted(id_ & 0x7F)
+                if id_ == SDO_ANSWER + node and len(data) == 8 and is_answer(data):
+                    found = data
         return found
 
     @staticmethod

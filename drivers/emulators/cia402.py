@@ -1,9 +1,10 @@
-"""Emulated CiA-402 drives behind an slcan adapter, on a pty or TCP; they move an arm of any backend."""
+"""Emulated CiA-402 drives behind an slcan adapter (pty, TCP) or on a virtual bus; they move an arm of any backend."""
 
 from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -11,10 +12,11 @@ from pydantic import Field
 
 from drivers.cia402.states import DriveState
 from drivers.emulators.base import WireEmulator, time_of
+from drivers.emulators.can_port import CanLines, VirtualCanPort, can_address
 from drivers.emulators.faults import FaultOptions
-from drivers.emulators.ports import Peer, PtyPort, TcpPort
+from drivers.emulators.ports import FarPort, Peer, PtyPort, TcpPort
 from drivers.kinds.arms import kinematics_of
-from drivers.transport.canbus import CanFrame, Slcan
+from drivers.transport.can_frames import CanFrame
 from hal.devices import Arm, Device
 from hal.errors import CellError, Unsupported
 from hal.strict import validate
@@ -33,10 +35,17 @@ HOST_LOST = 0x8130
 SIZES = {1: 0x4F, 2: 0x4B, 3: 0x47, 4: 0x43}
 
 
+PORTS: dict[str, Callable[[], FarPort]] = {
+    "serial": lambda: PtyPort("slcan"),
+    "tcp": TcpPort,
+    "virtual": lambda: VirtualCanPort("cia402"),
+}
+
+
 class Cia402EmulatorOptions(FaultOptions):
     """`[emulators.NAME.emulator_options]`"""
 
-    transport: Literal["serial", "tcp"] = "serial"
+    transport: Literal["serial", "tcp", "virtual"] = "serial"
     first_node: Annotated[int, Field(ge=1, le=100)] = 1
 
 
@@ -97,11 +106,11 @@ class Cia402Emulator(WireEmulator):
     """Running emulator of one drive per joint of the backing arm."""
 
     def __init__(self, backing: Arm, options: Cia402EmulatorOptions) -> None:
-        super().__init__(TcpPort() if options.transport == "tcp" else PtyPort("slcan"), options, name="cia402")
+        super().__init__(PORTS[options.transport](), options, name="cia402")
         self._backing = backing
         self.nodes = tuple(range(options.first_node, options.first_node + len(backing.capabilities().links)))
         self.drives = {node: Drive() for node in self.nodes}
-        self._codec = Slcan()
+        self._lines = CanLines()
         self._device_s = 0.0
         self._host_s: float | None = None
         self._consumer_s = 0.0
@@ -112,16 +121,14 @@ class Cia402Emulator(WireEmulator):
     @property
     def address(self) -> dict[str, Any]:
         """Return the driver options: channel, node numbers and kinematics."""
-        c = self._backing.capabilities()
-        far = self.port.address
-        channel = f"tcp://{far['host']}:{far['port']}" if "host" in far else far["port"]
-        return {"channel": channel, "nodes": list(self.nodes), "kinematics": kinematics_of(c)}
+        kinematics = kinematics_of(self._backing.capabilities())
+        return {**can_address(self.port), "nodes": list(self.nodes), "kinematics": kinematics}
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
         """Acknowledge slcan commands and carry out CAN frames."""
         if b"O\r" in data:
             self.reply(peer, b"\r")
-        for frame in self._codec.feed(data):
+        for frame in self._lines.feed(data):
             self._frame(frame)
 
     def on_tick(self) -> None:
@@ -148,7 +155,7 @@ class Cia402Emulator(WireEmulator):
 
     def status_frame(self) -> bytes | None:
         """Return an emergency message that reports over-current in the first drive."""
-        return self._codec.encode(CanFrame(0x80 + self.nodes[0], struct.pack("<HB5x", 0x2310, 0x02)))
+        return self._lines.encode(CanFrame(0x80 + self.nodes[0], struct.pack("<HB5x", 0x2310, 0x02)))
 
     def _frame(self, frame: CanFrame) -> None:
         node, function = frame.id & 0x7F, frame.id & 0x780
@@ -215,7 +222,7 @@ class Cia402Emulator(WireEmulator):
 
     def _out(self, id_: int, data: bytes) -> None:
         # A CAN bus checks its frames itself (CRC-15), so a damaged one never reaches the adapter.
-        self.send(None, self._codec.encode(CanFrame(id_, data)), protected=slice(0, 0))
+        self.send(None, self._lines.encode(CanFrame(id_, data)), protected=slice(0, 0))
 
 
 def start(backing: Device, options: dict[str, Any]) -> Cia402Emulator:

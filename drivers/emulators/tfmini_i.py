@@ -5,15 +5,16 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
 from drivers.emulators.base import WireEmulator
+from drivers.emulators.can_port import CanLines, VirtualCanPort, can_address
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.modbus_server import ModbusFarSide, RegistersOnly, no_such
 from drivers.emulators.ports import Peer, PtyPort
-from drivers.transport.canbus import CanFrame, Slcan
+from drivers.transport.can_frames import CanFrame
 from hal.clock import Deadline, WallClock
 from hal.devices import Device, Proximity
 from hal.errors import Unsupported
@@ -32,6 +33,12 @@ class TfminiIOptions(FaultOptions):
 
     rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
     clock_start_ms: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
+
+
+class CanTfminiIOptions(TfminiIOptions):
+    """`[emulators.NAME.emulator_options]` on a CAN bus."""
+
+    transport: Literal["serial", "virtual"] = "serial"
 
 
 class Measurement:
@@ -79,19 +86,20 @@ class TfminiITable(RegistersOnly):
 
 
 class CanTfminiEmulator(WireEmulator):
-    """Running emulator of the sensor on a CAN bus behind an slcan adapter."""
+    """Running emulator of the sensor behind an slcan adapter or on a virtual bus."""
 
-    def __init__(self, measurement: Measurement, options: TfminiIOptions) -> None:
-        super().__init__(PtyPort("slcan"), options, name="tfmini_can")
+    def __init__(self, measurement: Measurement, options: CanTfminiIOptions) -> None:
+        is_virtual = options.transport == "virtual"
+        super().__init__(VirtualCanPort("tfmini") if is_virtual else PtyPort("slcan"), options, name="tfmini_can")
         self._measurement = measurement
-        self._codec = Slcan()
-        self.is_open = False
+        self._lines = CanLines()
+        self.is_open = is_virtual
         self.period_s = 1.0 / options.rate_hz
 
     @property
     def address(self) -> dict[str, Any]:
-        """Return `{"channel": PATH}`."""
-        return {"channel": super().address["port"]}
+        """Return the driver options that lead to the bus."""
+        return can_address(self.port)
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
         """Carry out the adapter's commands to open and close the channel."""
@@ -111,22 +119,25 @@ class CanTfminiEmulator(WireEmulator):
         return self._frame(0, WEAK, self._measurement.newest()[2])
 
     def _frame(self, raw: int, strength: int, stamp_ms: int) -> bytes:
-        return self._codec.encode(CanFrame(CAN_ID, struct.pack("<HHI", raw, strength, stamp_ms)))
+        return self._lines.encode(CanFrame(CAN_ID, struct.pack("<HHI", raw, strength, stamp_ms)))
 
 
-def _measurement(backing: Device, options: dict[str, Any]) -> tuple[Measurement, TfminiIOptions]:
+Options = TypeVar("Options", bound=TfminiIOptions)
+
+
+def _measurement(backing: Device, options: dict[str, Any], model: type[Options]) -> tuple[Measurement, Options]:
     if not isinstance(backing, Proximity):
         raise Unsupported(
             f"the emulator of a TFmini-i distance sensor cannot be backed by a device of kind {backing.kind}",
             hint="choose a driver of kind proximity as the emulator's backing device",
         )
-    parsed = validate(options, TfminiIOptions, source="emulators.tfmini_i")
+    parsed = validate(options, model, source="emulators.tfmini_i")
     return Measurement(backing, parsed), parsed
 
 
 def start_modbus(backing: Device, options: dict[str, Any]) -> ModbusFarSide:
     """Start the Modbus emulator on a proximity device (entry point `tfmini_modbus`)."""
-    measurement, parsed = _measurement(backing, options)
+    measurement, parsed = _measurement(backing, options, TfminiIOptions)
     emulator = ModbusFarSide(PtyPort("tfmini"), parsed, TfminiITable(measurement), unit=UNIT, name="tfmini_modbus")
     emulator.begin()
     return emulator
@@ -134,7 +145,7 @@ def start_modbus(backing: Device, options: dict[str, Any]) -> ModbusFarSide:
 
 def start_can(backing: Device, options: dict[str, Any]) -> CanTfminiEmulator:
     """Start the CAN emulator on a proximity device (entry point `tfmini_can`)."""
-    measurement, parsed = _measurement(backing, options)
+    measurement, parsed = _measurement(backing, options, CanTfminiIOptions)
     emulator = CanTfminiEmulator(measurement, parsed)
     emulator.begin()
     return emulator

@@ -10,8 +10,7 @@ from typing import Generic, Protocol, TypeVar
 
 from drivers.transport.capture import inside
 from drivers.transport.device import CONNECT_S, WireDevice
-from drivers.transport.fd_link import FdLink
-from drivers.transport.link import BadAnswer, Link, LinkLost, NoAnswer, WireError, now_s
+from drivers.transport.link import BadAnswer, CountingLink, Link, LinkLost, NoAnswer, WireError, now_s
 from drivers.transport.port import Port
 from drivers.transport.timebase import ExchangeTime
 from hal.clock import Deadline
@@ -77,7 +76,7 @@ class Bus(Generic[C]):
         self._rest = threading.Event()  # never set: waiting on it is a sleep
         self._port: Port[Link] | None = None
         self._members = threading.Lock()
-        self._line: FdLink | None = None
+        self._line: CountingLink | None = None
 
     def attach(self, station: Station[C]) -> None:
         """Add a station; the first one starts the owner thread."""
@@ -146,7 +145,7 @@ class Bus(Generic[C]):
 
     def set_up(self, link: Link) -> None:
         """Create a client on the new link and mark every station for set-up (owner thread)."""
-        self._line = inside(link, FdLink)
+        self._line = inside(link, CountingLink)
         with self._lock:
             self._client = self._make_client(link)
         for slot in self._slots:

@@ -7,20 +7,19 @@ import os
 import select
 import threading
 
-from drivers.transport.link import LinkLost, NoAnswer, now_s
+from drivers.transport.link import CountingLink, LinkLost, NoAnswer, now_s
 
 CHUNK_BYTES = 65_536
 LOOK_UP_S = 0.02  # longest time that a cancelled read may continue
 SELECT_MOST = 1024  # `select` accepts descriptors below this number only
 
 
-class FdLink:
+class FdLink(CountingLink):
     """Link over an open, non-blocking descriptor that this object owns."""
 
     def __init__(self, fd: int, name: str) -> None:
         self._fd = fd
         self._name = name
-        self.received = 0  # bytes so far: distinguishes a dead line from bytes that no parser accepts
         self._is_cancelled = False
         self._write_lock = threading.Lock()
         self._close_lock = threading.Lock()

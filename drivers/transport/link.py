@@ -85,6 +85,12 @@ class Link(Protocol):
         ...
 
 
+class CountingLink:
+    """Base of links that count the bytes received: this distinguishes a dead line from bytes that no parser accepts."""
+
+    received = 0
+
+
 @runtime_checkable
 class Cancellable(Protocol):
     """Link whose reads another thread can end, so that `close` need not wait while a set-up waits seconds for answers."""

@@ -8,8 +8,7 @@ from typing import TypeVar
 
 from drivers.transport.capture import inside
 from drivers.transport.device import CONNECT_S, SLICE_S, PortDevice
-from drivers.transport.fd_link import FdLink
-from drivers.transport.link import Link, LinkLost, NoAnswer, now_s
+from drivers.transport.link import CountingLink, Link, LinkLost, NoAnswer, now_s
 from drivers.transport.port import Port
 from hal.registry import Context
 
@@ -41,7 +40,7 @@ class StreamDevice(PortDevice[T]):
         self._silence_s = self.patience * silence_s
         self._heard_s = now_s()
         self.bytes_in = 0
-        self._line: FdLink | None = None
+        self._line: CountingLink | None = None
         self._heard_before = 0
         self.byte_s = 0.0
         self.port = Port(context.name, open_link=open_link, tenant=self, realtime_priority=realtime_priority)
@@ -66,7 +65,7 @@ class StreamDevice(PortDevice[T]):
     def set_up(self, link: Link) -> None:
         """Start the stream (owner thread)."""
         self._heard_before = self.heard_bytes() or 0
-        self._line = inside(link, FdLink)
+        self._line = inside(link, CountingLink)
         self.byte_s = link.byte_s
         self.start(link)
         self._heard_s = now_s()

@@ -11,7 +11,7 @@ from pymodbus.client import ModbusSerialClient
 from drivers.emulators import tfmini_i as emulator
 from drivers.emulators.scripted import ScriptedLights, ScriptedProximity
 from drivers.tfmini_i import CanTfmini, CanTfminiOptions, SensorClock
-from drivers.transport.canbus import CanFrame, Slcan
+from drivers.transport.can_frames import CanFrame, record
 from hal.conformance import ProximityContract, Rig
 from hal.errors import Unsupported
 from hal.readings import Cause, Quality
@@ -32,6 +32,14 @@ class TestOverCan(ProximityContract):
     @pytest.fixture
     def rig(self) -> Iterator[Rig[Any]]:
         with wired_rig(emulator.start_can(ScriptedProximity(), {}), "can:tfmini", sample_period_s=0.05) as rig:
+            yield rig
+
+
+class TestOverAVirtualCanBus(ProximityContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        far_side = emulator.start_can(ScriptedProximity(), {"transport": "virtual"})
+        with wired_rig(far_side, "can:tfmini", sample_period_s=0.05) as rig:
             yield rig
 
 
@@ -67,9 +75,9 @@ def test_a_measurement_that_was_read_before_is_no_new_sample() -> None:
 def test_frames_of_the_tf03_repeated_of_other_nodes_and_of_other_lengths(order: Any) -> None:
     device = CanTfmini(Context(name="finger"), CanTfminiOptions(channel="/dev/null", byte_order=order))
     mark = "<" if order == "little" else ">"
-    codec, reading = Slcan(), struct.pack(mark + "HHH", 123, 500, 0)
+    reading = struct.pack(mark + "HHH", 123, 500, 0)
     for id_, data in ((3, reading), (3, reading), (4, bytes(8)), (3, bytes(5))):
-        device.receive(codec.encode(CanFrame(id_, data)), 1.0)
+        device.receive(record(CanFrame(id_, data)), 1.0)
     samples, _ = device.mailbox.since(0)
     assert [sample.value for sample in samples] == [pytest.approx(1.23)], "one that came twice is one"
     assert samples[0].device_time_s is None

@@ -1,4 +1,4 @@
-"""Tests of the CiA-402 arm over slcan: conformance, watchdog, emergencies, restarts, faults, python-can as client."""
+"""Tests of the CiA-402 arm over slcan and a virtual bus: conformance, watchdog, emergencies, restarts, faults."""
 
 import struct
 import threading
@@ -9,20 +9,17 @@ import can
 import canopen
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from drivers.cia402.arm import Cia402, Cia402Options
 from drivers.cia402.states import DriveState
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm
 from drivers.kinds.arms import kinematics_of
-from drivers.tfmini_i import CanTfminiOptions
-from drivers.transport.canbus import RAW, CanFrame, RawCan, Slcan
+from drivers.transport.can_frames import CanFrame, record
 from drivers.transport.link import NoAnswer
 from drivers.transport.options import read_options
 from hal.conformance import ArmContract, Rig
-from hal.errors import CellError, ConfigError, DeviceFault, DeviceUnavailable, MotionRefused
+from hal.errors import CellError, DeviceFault, DeviceUnavailable, MotionRefused
 from hal.registry import Context, connect
 from tests.drivers.rigs import count_good, soon, until, wired, wired_rig
 
@@ -45,54 +42,20 @@ class TestOverTcp(ArmContract):
             yield rig
 
 
-@pytest.mark.parametrize("channel", ["tcp://", "tcp://127.0.0.1", "tcp://:4000", "tcp://host:70000", "tcp://host:x"])
-def test_a_channel_that_is_no_address_is_a_fault_of_the_cell_file(channel: str) -> None:
-    with pytest.raises(ConfigError, match="HOST:PORT"):
-        read_options(Context(name="arm"), {"channel": channel}, CanTfminiOptions)
+class TestOverAVirtualBus(ArmContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig[Any]]:
+        far_side = emulator.start(ScriptedArm(), {"transport": "virtual"})
+        with wired_rig(far_side, DRIVER, CALM, sample_period_s=0.1) as rig:
+            yield rig
 
 
-frames = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
-
-
-@given(st.lists(frames, max_size=6), st.integers(min_value=0))
-def test_slcan_lines_survive_any_chunking(sent: list[CanFrame], cut: int) -> None:
-    codec = Slcan()
-    data = b"z\r" + b"".join(codec.encode(frame) for frame in sent)
-    at = cut % (len(data) + 1)
-    assert codec.feed(data[:at]) + codec.feed(data[at:]) == sent
-
-
-@given(st.lists(frames, max_size=6))
-def test_kernel_frames_round_trip(sent: list[CanFrame]) -> None:
-    codec = RawCan()
-    assert codec.feed(b"".join(codec.encode(frame) for frame in sent)) == sent
-
-
-@pytest.mark.parametrize("flag", [0x80000000, 0x40000000, 0x20000000])
-def test_extended_remote_and_error_frames_of_the_kernel_are_not_taken_for_data(flag: int) -> None:
-    codec = RawCan()
-    own = CanFrame(0x181, b"123456")
-    foreign = RAW.pack(flag | own.id, 6, b"654321")
-    assert codec.feed(foreign + codec.encode(own) + foreign) == [own]
-
-
-def test_noise_and_a_false_header_before_a_line_cost_nothing() -> None:
-    codec = Slcan()
-    line = codec.encode(CanFrame(0x181, b"123456"))
-    assert codec.feed(b"\x00t9tt" + line[:5] + line) == [CanFrame(0x181, b"123456")]
-    assert codec.bad == 0
-
-
-def test_a_line_that_lost_characters_is_no_frame() -> None:
-    codec = Slcan()
-    assert codec.feed(b"t1816270023\rt18162700230000\rt1G12AABB\r") == []
-    assert codec.bad == 3
-
-
+@pytest.mark.parametrize("transport", ["serial", "virtual"])
 @pytest.mark.parametrize("fault", ["crc", "drop", "dup", "split", "delay", "silent", "garbage", "disconnect"])
-def test_no_fault_of_the_bus_gives_wrong_joints(fault: str) -> None:
+def test_no_fault_of_the_bus_gives_wrong_joints(fault: str, transport: str) -> None:
     arm = ScriptedArm()
     options = {
+        "transport": transport,
         "fault": fault,
         "every": 500 if fault == "disconnect" else 50,  # the set-up alone takes about 50 frames
         "seed": 8,
@@ -121,7 +84,7 @@ class Unread:
 def pdos(node: int, number: int, copies: int = 1) -> bytes:
     """Return both PDOs of a drive, `copies` times each, with the number of the SYNC as position."""
     frames = (0x180, struct.pack("<Hi", 0x27, number)), (0x280, struct.pack("<ih", number, 0))
-    return b"".join(copies * Slcan().encode(CanFrame(function + node, data)) for function, data in frames)
+    return b"".join(copies * record(CanFrame(function + node, data)) for function, data in frames)
 
 
 def test_a_repeated_pdo_is_not_taken_for_the_answer_to_the_next_sync() -> None:
@@ -137,7 +100,7 @@ def test_a_repeated_pdo_is_not_taken_for_the_answer_to_the_next_sync() -> None:
             device.receive(pdos(node, number, copies=2 if (node, number) == (6, 2) else 1), 0.0)
             if (sample := device.mailbox.peek()) is not None:
                 seen.append(np.degrees(sample.value.position_rad) * 1000)
-    assert link.written.count(b"t0800\r") == 4
+    assert link.written.count(record(CanFrame(0x080, b""))) == 4
     assert np.ptp(seen, axis=1).max() < 0.5, "joints of different moments"
     np.testing.assert_allclose(seen[-1], 4)
 
@@ -151,12 +114,12 @@ def lone_arm() -> Cia402:
 @pytest.mark.parametrize(("state", "told"), [(4, "stopped"), (0x7F, "pre-operational")])
 def test_a_drive_whose_heartbeat_says_that_it_is_not_operational_is_named_at_once(state: int, told: str) -> None:
     with pytest.raises(NoAnswer, match=f"node 3 says that it is {told}"):
-        lone_arm().receive(Slcan().encode(CanFrame(0x703, bytes([state]))), 10.0)
+        lone_arm().receive(record(CanFrame(0x703, bytes([state]))), 10.0)
 
 
 def test_pdos_of_a_wrong_length_are_named() -> None:
     device = lone_arm()
-    device.receive(Slcan().encode(CanFrame(0x182, bytes(4))), 10.0)
+    device.receive(record(CanFrame(0x182, bytes(4))), 10.0)
     assert "node 2 sends PDOs of 4 bytes, not 6" in device.wire_counts()
     assert device.errors == 1
 
@@ -168,12 +131,8 @@ def test_drives_that_answer_no_sync_and_their_emergencies_are_named() -> None:
         for node in (1, 2, 3, 5, 6):
             device.receive(pdos(node, 7), 0.0)
     assert device.wire_counts().endswith("nodes that answer no SYNC: 4")
-    device.receive(Slcan().encode(CanFrame(0x085, bytes.fromhex("1186200000000000"))), 0.0)
+    device.receive(record(CanFrame(0x085, bytes.fromhex("1186200000000000"))), 0.0)
     assert "5: operation_enabled, emergency 8611h" in str(device._not_enabled())
-
-
-def test_lines_with_time_stamps_are_frames_too() -> None:
-    assert Slcan().feed(b"t1812AABB1F40\rt1812AABB\r") == 2 * [CanFrame(0x181, b"\xaa\xbb")]
 
 
 def test_enabling_takes_the_measured_position_as_target() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from drivers.cia402.setup import CONSUMER, MAPPINGS, SdoClient, SetUp
 from drivers.cia402.sync import PDOS, PROBE_S, SyncCount
-from drivers.transport.canbus import CanFrame, Slcan
+from drivers.transport.can_frames import CanFrame, record, records
 from drivers.transport.link import NoAnswer, Refused
 from tests.drivers.rigs import ScriptLink
 
@@ -285,7 +285,7 @@ class SdoLine(ScriptLink):
     """slcan link whose other end answers each request with some frames."""
 
     def __init__(self, *frames: list[CanFrame]) -> None:
-        super().__init__(*(b"".join(map(Slcan().encode, answer)) for answer in frames))
+        super().__init__(*(b"".join(map(record, answer)) for answer in frames))
 
 
 def test_an_upload_in_segments_is_put_together() -> None:
@@ -294,14 +294,14 @@ def test_an_upload_in_segments_is_put_together() -> None:
         [CanFrame(0x581, bytes.fromhex("0810007a00000000"))],  # three bytes, more to come
         [CanFrame(0x581, bytes.fromhex("1d60000000000000"))],  # one byte, the last
     )
-    assert SdoClient(link, Slcan()).upload(1, 0x1600, 1) == 0x607A0010
-    assert [Slcan().feed(line)[0].data[0] for line in link.written] == [0x40, 0x60, 0x70]
+    assert SdoClient(link).upload(1, 0x1600, 1) == 0x607A0010
+    assert [data[0] for line in link.written for _, data, _ in records(line)] == [0x40, 0x60, 0x70]
 
 
 def test_a_boot_up_between_sdo_answers_is_told() -> None:
     restarted: list[int] = []
     link = SdoLine([CanFrame(0x702, b"\0"), CanFrame(0x581, bytes.fromhex("4b17100032000000"))])
-    assert SdoClient(link, Slcan(), restarted=restarted.append).upload(1, 0x1017, 0) == 50
+    assert SdoClient(link, restarted=restarted.append).upload(1, 0x1017, 0) == 50
     assert restarted == [2]
 
 

@@ -13,12 +13,11 @@ import numpy as np
 from pydantic import Field
 
 from drivers.kinds.force_torque import RangeOptions, capabilities
-from drivers.transport.bus import PolledDevice
 from drivers.transport.checks import crc_modbus
 from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.modbus import ModbusMaster, ModbusRtu
-from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.modbus_bus import ModbusDevice, ModbusOptions
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import FrameTimes
@@ -164,14 +163,13 @@ class Ft300Stream(StreamDevice[Wrench]):
         self.publish(value, valid_s=valid_s, quality=quality, cause=cause, missed=bad)
 
 
-class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
+class Ft300Registers(ModbusDevice[Wrench]):
     """Sensor as a Modbus slave, beside others on its bus."""
 
     kind = DeviceKind.FORCE_TORQUE
 
     def __init__(self, context: Context, options: PollOptions) -> None:
-        bus = modbus_bus(context, options)
-        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        super().__init__(context, options)
         self._options = options
 
     def capabilities(self) -> ForceTorqueCapabilities:
@@ -182,7 +180,7 @@ class Ft300Registers(PolledDevice[Wrench, ModbusMaster]):
         """Return the newest raw wrench."""
         return self.newest(deadline)
 
-    def set_up(self, client: ModbusMaster) -> None:
+    def prepare(self, client: ModbusMaster) -> None:
         """Check that the device is the sensor."""
         identify(client, self._options.unit)
 

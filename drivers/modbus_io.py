@@ -15,10 +15,9 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 from pydantic import Field, model_validator
 
 from drivers.kinds.digital_points import require_same_number, wanted_lights
-from drivers.transport.bus import PolledDevice
 from drivers.transport.link import WireError, now_s
 from drivers.transport.modbus import ModbusMaster
-from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.modbus_bus import ModbusDevice, ModbusOptions
 from drivers.transport.options import Seconds, read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, LightsCapabilities, ProximityCapabilities, TouchCapabilities
@@ -109,15 +108,12 @@ class SwitchOptions(IoOptions):
         return (self.input,)
 
 
-class IoDevice(PolledDevice[T, ModbusMaster]):
+class IoDevice(ModbusDevice[T]):
     """Some inputs of a remote I/O, read together."""
 
     def __init__(self, context: Context, options: IoOptions) -> None:
-        super().__init__(context, modbus_bus(context, options), rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        super().__init__(context, options)
         self._io = options
-
-    def set_up(self, client: ModbusMaster) -> None:
-        """Do nothing: the poll itself identifies the device."""
 
     def poll(self, client: ModbusMaster) -> None:
         """Read all inputs in one request."""
@@ -159,7 +155,7 @@ class IoLights(IoDevice[tuple[bool, ...]]):
         oldest_s = self.context.clock.now_s() - self.max_age_s
         return self.newest(deadline, not_before_s=max(oldest_s, self._commanded_s))
 
-    def set_up(self, client: ModbusMaster) -> None:
+    def prepare(self, client: ModbusMaster) -> None:
         """Restore the last commanded state of the lights after a loss."""
         if self._wanted is not None:
             self._write(client, self._wanted, now_s() + client.attempt_s)

@@ -12,10 +12,9 @@ from typing import Annotated, Any, Self
 from pydantic import Field, model_validator
 
 from drivers.kinds.grippers import require_finite, require_stroke
-from drivers.transport.bus import PolledDevice
 from drivers.transport.link import Refused, now_s
 from drivers.transport.modbus import ModbusMaster
-from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.modbus_bus import ModbusDevice, ModbusOptions
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import DeviceKind, GripperCapabilities, GripperState
@@ -101,14 +100,13 @@ def encode_command(*, action: int, position: int = 0, speed: int = 0, force: int
     return action << 8, position, speed << 8 | force
 
 
-class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
+class Robotiq2F(ModbusDevice[GripperState]):
     """Robotiq two-finger gripper."""
 
     kind = DeviceKind.GRIPPER
 
     def __init__(self, context: Context, options: GripperOptions) -> None:
-        bus = modbus_bus(context, options)
-        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        super().__init__(context, options)
         self._options = options
         self._goal: int | None = None
         self._force_n = 0.0
@@ -182,9 +180,6 @@ class Robotiq2F(PolledDevice[GripperState, ModbusMaster]):
 
     def _soon(self) -> Deadline:
         return Deadline.after(self.context.clock, 6 * self._options.timeout_s)
-
-    def set_up(self, client: ModbusMaster) -> None:
-        """Do nothing, because nothing may move here; the poll reads the gripper's state."""
 
     def poll(self, client: ModbusMaster) -> None:
         """Read three registers and publish width and grip."""

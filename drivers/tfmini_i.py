@@ -11,12 +11,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from drivers.tfmini import EchoOptions
-from drivers.transport.bus import PolledDevice
 from drivers.transport.can_frames import CanFrame, FrameReader
 from drivers.transport.canbus import CanOptions, can_opener
 from drivers.transport.link import Link, now_s
 from drivers.transport.modbus import ModbusMaster
-from drivers.transport.modbus_bus import ModbusOptions, modbus_bus
+from drivers.transport.modbus_bus import ModbusDevice, ModbusOptions
 from drivers.transport.options import read_options
 from drivers.transport.stream import StreamDevice
 from drivers.transport.timebase import FrameTimes, HostTime, Unwrapper
@@ -79,14 +78,13 @@ class SensorClock:
         return device_s, self._host.host_s(device_s=device_s, arrived_s=arrived_s)
 
 
-class ModbusTfmini(PolledDevice[float, ModbusMaster]):
+class ModbusTfmini(ModbusDevice[float]):
     """Distance sensor of a finger on a shared two-wire bus."""
 
     kind = DeviceKind.PROXIMITY
 
     def __init__(self, context: Context, options: ModbusTfminiOptions) -> None:
-        bus = modbus_bus(context, options)
-        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        super().__init__(context, options)
         self._options = options
         self._clock = SensorClock()
 
@@ -98,7 +96,7 @@ class ModbusTfmini(PolledDevice[float, ModbusMaster]):
         """Return the newest distance; invalid and NaN when the echo is too weak or out of range."""
         return self.newest(deadline)
 
-    def set_up(self, client: ModbusMaster) -> None:
+    def prepare(self, client: ModbusMaster) -> None:
         """Check by the firmware registers that the device is the sensor."""
         self._clock.reset()
         until_s = now_s() + client.attempt_s

@@ -148,6 +148,5 @@ def measured(device: Any) -> str:
         ages_s.append(clock.now_s() - sample.host_time_s)
     rate_hz = (device.mailbox.published - before) / (time.monotonic() - started_s)
     wait_ms, age_ms = 1e3 * statistics.median(waits_s), 1e3 * statistics.median(ages_s)
-    return (
-        f"{device.link_name()}: {rate_hz:.0f} samples/s, new one after {wait_ms:.1f} ms, {age_ms:.1f} ms old (medians)"
-    )
+    who = f" ({device.identified})" if device.identified else ""
+    return f"{device.link_name()}{who}: {rate_hz:.0f} samples/s, new one after {wait_ms:.1f} ms, {age_ms:.1f} ms old (medians)"

@@ -1,10 +1,21 @@
-"""Modbus server for RTU and TCP: answers request frames from a register map."""
+"""Modbus far side for RTU and TCP: pymodbus' server classes answer from a register map; ports and faults are ours."""
 
 from __future__ import annotations
 
+import asyncio
 import struct
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
+
+from pymodbus.constants import ExcCodes
+from pymodbus.exceptions import NoSuchIdException
+from pymodbus.framer import FramerType
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
+from pymodbus.pdu.mei_message import ReadDeviceInformationRequest, ReadDeviceInformationResponse
+from pymodbus.server import ModbusTcpServer
+from pymodbus.server.requesthandler import ServerRequestHandler
+from pymodbus.simulator import DataType, SimData, SimDevice
+from pymodbus.simulator.simcore import SimCore
 
 from drivers.emulators.base import WireEmulator
 from drivers.emulators.faults import FaultOptions
@@ -13,8 +24,10 @@ from drivers.transport.checks import crc_modbus
 from drivers.transport.framing import Framer
 from hal.errors import CellError
 
-ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
+ILLEGAL_ADDRESS = ExcCodes.ILLEGAL_ADDRESS
+VENDOR, REVISION = b"panelwright", b"1.0"
 MBAP = 7
+REQUESTS = DecodePDU(is_server=True)
 
 
 class ModbusException(Exception):
@@ -76,93 +89,161 @@ def no_such(*asked: int) -> ModbusException:
     return error
 
 
+class MapContext(SimCore):
+    """Data store of pymodbus' server, which reads and writes a register map in place of memory.
+
+    Args:
+        unit: the unit that answers; None for every unit, as behind a TCP address of its own.
+    """
+
+    def __init__(self, table: RegisterMap, unit: int | None) -> None:
+        super().__init__(SimDevice(0, simdata=SimData(0, datatype=DataType.REGISTERS)))
+        self._table = table
+        self._unit = unit
+        self._written: list[Any] = []
+
+    async def async_getValues(  # noqa: N802  # named by pymodbus
+        self, device_id: int, func_code: int, address: int, count: int = 1
+    ) -> list[Any] | ExcCodes:
+        """Return bits or registers; after a write of one value (functions 5 and 6), that value, which is acknowledged."""
+        self._require(device_id)
+        try:
+            match func_code:
+                case 1 | 2:
+                    return list(self._table.read_bits(func_code, address, count))
+                case 5 | 6:
+                    return self._written
+                case _:
+                    return list(self._table.read_registers(4 if func_code == 4 else 3, address, count))
+        except (ModbusException, CellError) as error:
+            return _code(error)
+
+    async def async_setValues(  # noqa: N802  # named by pymodbus
+        self, device_id: int, func_code: int, address: int, values: list[Any]
+    ) -> ExcCodes | None:
+        """Write coils (functions 5 and 15) or registers."""
+        self._require(device_id)
+        try:
+            write = self._table.write_bits if func_code in (5, 15) else self._table.write_registers
+            write(address, values)
+        except (ModbusException, CellError) as error:
+            return _code(error)
+        self._written = list(values)
+        return None
+
+    def _require(self, unit: int) -> None:
+        if self._unit not in (None, unit):
+            raise NoSuchIdException(f"unit {unit}")
+
+
+def _code(error: ModbusException | CellError) -> ExcCodes:
+    return ExcCodes(error.code) if isinstance(error, ModbusException) else ExcCodes.DEVICE_FAILURE
+
+
+class Connection(ServerRequestHandler):
+    """Connection of one host: pymodbus decodes, carries out and encodes; the emulator sends."""
+
+    def __init__(self, far_side: ModbusFarSide, server: ModbusTcpServer, peer: Peer) -> None:
+        super().__init__(server, None, None, None)  # type: ignore[no-untyped-call]
+        self._far_side = far_side
+        self._peer = peer
+
+    def callback_data(self, data: bytes, addr: tuple[Any, ...] | None = None) -> int:
+        """Decode one request."""
+        used = super().callback_data(data, addr)
+        if self.last_pdu is not None:
+            self._far_side.last_function = self.last_pdu.function_code
+        return used
+
+    async def respond(self, frame: bytes) -> None:
+        """Answer one request; identification is answered here, because pymodbus has one identity per process."""
+        self.callback_data(frame)
+        request = self.last_pdu
+        if isinstance(request, ReadDeviceInformationRequest):
+            self.server_send(self._far_side.identity(request), None)  # type: ignore[no-untyped-call]
+        else:
+            await self.handle_request()  # type: ignore[no-untyped-call]
+
+    def handle_later(self) -> None:
+        """Do nothing: `respond` has answered."""
+
+    def send(self, data: bytes, addr: tuple[Any, ...] | None = None) -> None:  # noqa: ARG002  # one peer
+        """Send an answer through the emulator's faults."""
+        self._far_side.deliver(self._peer, data)
+
+
 class ModbusFarSide(WireEmulator):
     """Modbus server on a pty (RTU) or a TCP listener."""
 
     def __init__(self, port: FarPort, options: FaultOptions, table: RegisterMap, *, unit: int, name: str) -> None:
         super().__init__(port, options, name=name)
-        self._table = table
         self._unit = unit
+        self._name = name
         self._is_rtu = isinstance(port, PtyPort)
+        self._context = MapContext(table, unit if self._is_rtu else None)
         self._rtu = Framer(bytes([unit]), _rtu_request_length, lambda f: crc_modbus(f) == 0)
         self._tcp: dict[Peer, bytes] = {}
-        self._last_request = b""
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._server: ModbusTcpServer | None = None
+        self._connections: dict[Peer, Connection] = {}
+        self.last_function = 0
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
         """Answer each complete request."""
-        if self._is_rtu:
-            for frame in self._rtu.feed(data):
-                answer = bytes([self._unit]) + self._answer(frame[1:-2])
-                self.send(peer, answer + struct.pack("<H", crc_modbus(answer)))
-            return
-        buffer = self._tcp.get(peer, b"") + data
-        while len(buffer) > MBAP and len(buffer) >= 6 + (size := struct.unpack_from(">H", buffer, 4)[0]):
-            head, pdu, buffer = buffer[:MBAP], buffer[MBAP : 6 + size], buffer[6 + size :]
-            answer = self._answer(pdu)
-            self.send(peer, head[:4] + struct.pack(">HB", len(answer) + 1, head[6]) + answer, protected=slice(0, 8))
+        for frame in self._rtu.feed(data) if self._is_rtu else self._tcp_frames(peer, data):
+            loop = self._loop = self._loop or asyncio.new_event_loop()
+            loop.run_until_complete(self._respond(peer, frame))
+
+    def _tcp_frames(self, peer: Peer, data: bytes) -> list[bytes]:
+        buffer, frames = self._tcp.get(peer, b"") + data, []
+        while len(buffer) > MBAP and len(buffer) >= (end := 6 + struct.unpack_from(">H", buffer, 4)[0]):
+            frames.append(buffer[:end])
+            buffer = buffer[end:]
         self._tcp[peer] = buffer
+        return frames
+
+    async def _respond(self, peer: Peer, frame: bytes) -> None:
+        if self._server is None:
+            framer = FramerType.RTU if self._is_rtu else FramerType.SOCKET
+            device = SimDevice(0, simdata=SimData(0, datatype=DataType.REGISTERS))
+            self._server = ModbusTcpServer(device, framer=framer, ignore_missing_devices=True)
+            self._server.context = self._context
+        if peer not in self._connections:
+            self._connections[peer] = Connection(self, self._server, peer)
+        await self._connections[peer].respond(frame)
+
+    def identity(self, request: ReadDeviceInformationRequest) -> ModbusPDU:
+        """Return the answer to a request for the device's identification."""
+        texts = {0: VENDOR, 1: self._name.encode(), 2: REVISION}
+        answer = ReadDeviceInformationResponse(read_code=request.read_code, information=texts, dev_id=request.dev_id)
+        answer.transaction_id = request.transaction_id
+        return answer
+
+    def deliver(self, peer: Peer, frame: bytes) -> None:
+        """Send an answer through the fault plan."""
+        self.send(peer, frame, protected=slice(None) if self._is_rtu else slice(0, 8))
 
     def status_frame(self) -> bytes | None:
         """Return Modbus exception 4, device failure, for RTU; None for TCP."""
-        pdu = bytes([self._last_request[0] | 0x80, DEVICE_FAILURE])
-        if self._is_rtu:
-            return bytes([self._unit]) + pdu + struct.pack("<H", crc_modbus(bytes([self._unit]) + pdu))
-        return None
+        if not self._is_rtu:
+            return None
+        answer = ExceptionResponse(self.last_function, ExcCodes.DEVICE_FAILURE)
+        frame = bytes([self._unit, answer.function_code]) + answer.encode()
+        return frame + struct.pack("<H", crc_modbus(frame))
 
-    def _answer(self, pdu: bytes) -> bytes:
-        self._last_request = pdu
-        try:
-            return answer_pdu(self._table, pdu)
-        except ModbusException as error:
-            return bytes([pdu[0] | 0x80, error.code])
-        except CellError:
-            return bytes([pdu[0] | 0x80, DEVICE_FAILURE])
-
-
-def answer_pdu(table: RegisterMap, pdu: bytes) -> bytes:
-    """Return the answer to one request, without unit and checksum (Modbus application protocol V1.1b3, chapter 6)."""
-    function = pdu[0]
-    if function not in (1, 2, 3, 4, 5, 6, 15, 16, 23):
-        raise ModbusException(ILLEGAL_FUNCTION)
-    address, number = struct.unpack_from(">HH", pdu, 1)
-    match function:
-        case 1 | 2:
-            bits = table.read_bits(function, address, number)
-            word = sum(1 << i for i, bit in enumerate(bits) if bit)
-            data = word.to_bytes((number + 7) // 8, "little")
-            return bytes([function, len(data)]) + data
-        case 3 | 4:
-            return _registers(function, table.read_registers(function, address, number))
-        case 5:
-            if number not in (0, 0xFF00):
-                raise ModbusException(ILLEGAL_VALUE)
-            table.write_bits(address, [number == 0xFF00])
-        case 6:
-            table.write_registers(address, [number])
-        case 15:
-            word = int.from_bytes(pdu[6:], "little")
-            table.write_bits(address, [bool(word >> i & 1) for i in range(number)])
-        case 16:
-            table.write_registers(address, struct.unpack(f">{number}H", pdu[6 : 6 + 2 * number]))
-        case _:
-            write_address, write_count = struct.unpack_from(">HH", pdu, 5)
-            table.write_registers(write_address, struct.unpack(f">{write_count}H", pdu[10 : 10 + 2 * write_count]))
-            return _registers(function, table.read_registers(3, address, number))
-    return pdu[:5]
-
-
-def _registers(function: int, values: Sequence[int]) -> bytes:
-    return bytes([function, 2 * len(values)]) + struct.pack(f">{len(values)}H", *values)
+    def close(self) -> None:
+        """End the thread and close the port and the server's event loop; a second call does nothing."""
+        super().close()
+        loop, self._loop = self._loop, None
+        if loop is not None and not loop.is_running():
+            loop.close()
 
 
 def _rtu_request_length(data: bytes) -> int | None:
     """Return the length of the RTU request at the start of `data`; None if not yet known, 0 if it is no request."""
-    if len(data) < 2:
+    if len(data) < 3:
         return None
-    function = data[1]
-    if 1 <= function <= 6:
-        return 8
-    count_at = {15: 6, 16: 6, 23: 10}.get(function)
-    if count_at is None:
+    kind = None if data[1] & 0x80 else REQUESTS.lookupPduClass(data)
+    if kind is None or not (kind.rtu_frame_size or kind.rtu_byte_count_pos):
         return 0
-    return None if len(data) <= count_at else count_at + 1 + data[count_at] + 2
+    return kind.calculateRtuFrameSize(data) or None

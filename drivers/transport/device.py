@@ -65,6 +65,7 @@ class WireDevice(Generic[T]):
         self._is_closed = False
         self._state = threading.Lock()
         self._last_error = "not connected yet"
+        self.identified = ""  # vendor, product and revision, where the protocol tells them
 
     @property
     def name(self) -> str:
@@ -199,11 +200,12 @@ class WireDevice(Generic[T]):
         """Return the state of the link and of the newest sample, without waiting."""
         newest, error = self.mailbox.peek(), self.mailbox.error()
         quality, cause = self._condition(newest, error)
+        told = (self.link_name(), self.identified, self.wire_counts(), error.what if error else "")
         return Health(
             connected=self.is_up() and not self._is_closed,
             quality=quality,
             cause=cause,
-            detail=f"{self.link_name()}; {self.wire_counts()}" + (f"; {error.what}" if error else ""),
+            detail="; ".join(text for text in told if text),
             samples=self.mailbox.published,
             errors=self.errors,
             reconnects=self.reconnects(),

@@ -1,8 +1,7 @@
-"""Modbus masters over RTU and TCP: one write per request, answers parsed by their length.
+"""Modbus masters over RTU and TCP: pymodbus encodes and decodes; deadlines, framing and the order of answers are ours.
 
-pymodbus reaches 418 RTU reads per second where a bare port reaches 17,943, and it accepted 13 of 45 late answers as
-the answer to the next request. Only function codes 1-4, 15 and 16 are sent: on a two-wire bus with echo, the echo of a
-request with function 5 or 6 is identical to its acknowledgement.
+docs/decisions/0007-modbus-timing.md says why, with figures. Only functions 1-4, 15, 16 and 43 are sent: on a two-wire
+bus with echo, the echo of a request with function 5 or 6 is identical to its acknowledgement.
 """
 
 from __future__ import annotations
@@ -10,13 +9,22 @@ from __future__ import annotations
 import contextlib
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from drivers.transport.checks import crc_modbus
 from drivers.transport.link import Link, NoAnswer, Refused, drain, drain_until_quiet, now_s
 
+if TYPE_CHECKING:
+    from pymodbus.pdu import ModbusPDU
+
+    from drivers.transport.modbus_pdu import Question
+
 READ_COILS, READ_INPUTS, READ_HOLDING, READ_INPUT_REGISTERS = 1, 2, 3, 4
 WRITE_COILS, WRITE_REGISTERS = 15, 16
+IDENTIFY = 43
+VENDOR, PRODUCT, REVISION = 0, 1, 2
 EXCEPTIONS = {
     1: "function not known",
     2: "no such address",
@@ -37,11 +45,26 @@ HINTS = {
     10: "check the unit number, and the wiring behind the gateway",
     11: "check the unit number, and the wiring behind the gateway",
 }
+FIRST_PROBES = (IDENTIFY, READ_HOLDING)
+PROBES = (READ_HOLDING, READ_INPUT_REGISTERS, READ_INPUTS, READ_COILS)  # some devices have registers only
+RARE_COUNT = 11  # no driver reads as many registers, or as many bytes of inputs
 RTU_GAP_S = 0.00175  # 3.5 characters above 19200 baud (Modbus over serial line V1.02, 2.5.1.1)
 
 
 class Busy(NoAnswer):
     """The device asks for more time (exception 5 or 6)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a device says of itself (function 43, type 14)."""
+
+    vendor: str
+    product: str
+    revision: str
+
+    def __str__(self) -> str:
+        return " ".join(text for text in (self.vendor, self.product, self.revision) if text)
 
 
 class ModbusMaster(ABC):
@@ -52,8 +75,12 @@ class ModbusMaster(ABC):
     """
 
     def __init__(self, link: Link, *, timeout_s: float) -> None:
+        from drivers.transport import modbus_pdu
+
+        self._pdus = modbus_pdu
         self._link = link
         self._timeout_s = timeout_s
+        self._identities: dict[int, Identity | None] = {}
         self.late_bytes = 0
         self.asked_s = 0.0  # when the last request was sent
 
@@ -61,33 +88,48 @@ class ModbusMaster(ABC):
         self, *, unit: int, address: int, count: int, until_s: float, function: int = READ_INPUTS
     ) -> tuple[bool, ...]:
         """Read `count` coils (function 1) or discrete inputs (2)."""
-        size = (count + 7) // 8
-        data = self._ask(unit, struct.pack(">BHH", function, address, count), bytes([function, size]), size, until_s)
-        word = int.from_bytes(data, "little")
-        return tuple(bool(word >> i & 1) for i in range(count))
+        answer = self._ask(unit, self._pdus.read_bits(function, address, count), until_s)
+        return tuple(answer.bits[:count])
 
     def read_registers(
         self, *, unit: int, address: int, count: int, until_s: float, function: int = READ_HOLDING
     ) -> tuple[int, ...]:
         """Read `count` holding (function 3) or input (4) registers, unsigned."""
-        request = struct.pack(">BHH", function, address, count)
-        return struct.unpack(f">{count}H", self._ask(unit, request, bytes([function, 2 * count]), 2 * count, until_s))
+        return tuple(self._ask(unit, self._pdus.read_registers(function, address, count), until_s).registers)
 
     def write_coils(self, *, unit: int, address: int, values: Sequence[bool], until_s: float) -> None:
         """Write consecutive coils (function 15)."""
-        word = sum(1 << i for i, value in enumerate(values) if value)
-        data = word.to_bytes((len(values) + 7) // 8, "little")
-        echoed = struct.pack(">BHH", WRITE_COILS, address, len(values))
-        self._ask(unit, echoed + bytes([len(data)]) + data, echoed, 0, until_s)
+        self._ask(unit, self._pdus.write_bits(address, values), until_s)
 
     def write_registers(self, *, unit: int, address: int, values: Sequence[int], until_s: float) -> None:
         """Write consecutive holding registers (function 16)."""
-        echoed = struct.pack(">BHH", WRITE_REGISTERS, address, len(values))
-        data = struct.pack(f">{len(values)}H", *values)
-        self._ask(unit, echoed + bytes([len(data)]) + data, echoed, 0, until_s)
+        self._ask(unit, self._pdus.write_registers(address, values), until_s)
 
-    def _ask(self, unit: int, request: bytes, answer_head: bytes, rest: int, until_s: float) -> bytes:
-        """Return the part of the answer after `answer_head`; ask again after a lost answer while time remains.
+    def identity(self, unit: int, until_s: float) -> Identity | None:
+        """Return vendor, product and revision, which the device is asked for until it has answered; None if it does not.
+
+        Raises:
+            LinkLost: the port is gone.
+        """
+        if unit not in self._identities:
+            with contextlib.suppress(NoAnswer):
+                self._identify(unit, until_s, self._ask)
+        return self._identities.get(unit)
+
+    def _identify(self, unit: int, until_s: float, ask: Callable[[int, Question, float], ModbusPDU]) -> None:
+        try:
+            answer = ask(unit, self._pdus.read_identity(), until_s)
+        except Refused:
+            self._identities[unit] = None
+            return
+        texts, following = self._pdus.identity_objects(answer)
+        while following > max(texts, default=REVISION):
+            more, following = self._pdus.identity_objects(self._ask(unit, self._pdus.read_identity(following), until_s))
+            texts |= more
+        self._identities[unit] = Identity(*(texts.get(number, "") for number in (VENDOR, PRODUCT, REVISION)))
+
+    def _ask(self, unit: int, question: Question, until_s: float) -> ModbusPDU:
+        """Return the answer; ask again after a lost one while time remains.
 
         Each exchange is repeated on its own, so that a task of several exchanges does not restart with every lost frame.
 
@@ -98,7 +140,7 @@ class ModbusMaster(ABC):
         """
         while True:
             try:
-                return self._exchange(unit, request, answer_head, rest, until_s)
+                return self._exchange(unit, question, until_s)
             except NoAnswer as error:
                 left_s = until_s - now_s()
                 if left_s < (self.attempt_s if isinstance(error, Busy) else 0.5 * self._timeout_s):
@@ -111,23 +153,27 @@ class ModbusMaster(ABC):
         """Return the time that a poll should allow per attempt, including clearing the line beforehand, in seconds."""
         return self._timeout_s
 
-    def _listen(self, unit: int, head: bytes, rest: int, until_s: float) -> bytes:
+    def _listen(self, unit: int, question: Question, until_s: float) -> ModbusPDU:
         buffer, answer_until_s = b"", self._answer_until(until_s)
         while chunk := self._link.read(answer_until_s):
             buffer += chunk
-            found = self._find(buffer, unit, head, rest)
-            if found is not None:
-                return found
+            found = self._find(buffer, unit, question)
+            if found:
+                answer = self._pdus.decode(question, found)
+                if answer.isError():
+                    raise exception(unit, question.function, answer.exception_code)
+                return answer
         raise self._silence(buffer, unit)
 
     @abstractmethod
-    def _find(self, buffer: bytes, unit: int, head: bytes, rest: int) -> bytes | None: ...
+    def _find(self, buffer: bytes, unit: int, question: Question) -> bytes:
+        """Return the answer's PDU, or nothing while it has not arrived whole."""
 
     def _answer_until(self, until_s: float) -> float:
         return min(until_s, now_s() + self._timeout_s)
 
     @abstractmethod
-    def _exchange(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes: ...
+    def _exchange(self, unit: int, question: Question, until_s: float) -> ModbusPDU: ...
 
     def _silence(self, buffer: bytes, unit: int) -> NoAnswer:
         got = f"{len(buffer)} bytes that do not fit: {buffer[:16].hex(' ')}" if buffer else "not one byte"
@@ -151,84 +197,106 @@ class ModbusTcp(ModbusMaster):
         super().__init__(link, timeout_s=timeout_s)
         self._tid = 0
 
-    def _exchange(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes:
+    def _exchange(self, unit: int, question: Question, until_s: float) -> ModbusPDU:
         self._tid = self._tid % 0xFFFF + 1
         self.late_bytes += len(drain(self._link))
         self.asked_s = now_s()
-        self._link.write(struct.pack(">HHHB", self._tid, 0, len(request) + 1, unit) + request, until_s)
-        return self._listen(unit, head, rest, until_s)
+        self._link.write(
+            struct.pack(">HHHB", self._tid, 0, len(question.request) + 1, unit) + question.request, until_s
+        )
+        return self._listen(unit, question, until_s)
 
-    def _find(self, buffer: bytes, unit: int, head: bytes, rest: int) -> bytes | None:
-        good = struct.pack(">HHHB", self._tid, 0, len(head) + rest + 1, unit) + head
-        at = buffer.find(good)
-        if at >= 0:
-            data = buffer[at + len(good) : at + len(good) + rest]
-            return data if len(data) == rest else None
-        bad = struct.pack(">HHHBB", self._tid, 0, 3, unit, head[0] | 0x80)
-        at = buffer.find(bad)
-        if 0 <= at < len(buffer) - len(bad):
-            raise exception(unit, head[0], buffer[at + len(bad)])
-        return None
+    def _find(self, buffer: bytes, unit: int, question: Question) -> bytes:
+        start = struct.pack(">HH", self._tid, 0)
+        at = buffer.find(start)
+        while at >= 0:
+            size = int.from_bytes(buffer[at + 4 : at + 6], "big")
+            frame = buffer[at + 6 : at + 6 + size]
+            for head, kind in question.forms:
+                # pymodbus gives the length of an RTU frame with this content, which ends with two more bytes.
+                is_like_it = len(frame) == size and frame.startswith(bytes([unit]) + head)
+                if is_like_it and kind.calculateRtuFrameSize(frame) == size + 2:
+                    return frame[1:]
+            at = buffer.find(start, at + 1)
+        return b""
 
 
 class ModbusRtu(ModbusMaster):
     """Modbus RTU master.
 
     RTU has no transaction id. After a time-out, no request like the lost one is sent until the line is known to be
-    clear: late bytes are drained, and if the next request could accept the lost answer, a different function is requested
-    first. A device answers in order, so whatever follows that answer is new.
+    clear: late bytes are drained, and if the next request could accept the lost answer, another request is sent first,
+    whose answer cannot be confused with it. A device answers in order, so whatever follows that answer is new. The first
+    request to a unit is preceded by such a probe too, because an answer to whoever had the port before may still come.
 
     Args:
         gap_s: silence before each request, in seconds; 0 where the line does not need it.
         quarantine_s: after a time-out, how long to wait for the late answer before asking again.
+        is_clear: whether it is certain that nobody had asked anything on this line before.
     """
 
-    def __init__(self, link: Link, *, timeout_s: float, gap_s: float = RTU_GAP_S, quarantine_s: float = 0.1) -> None:
+    def __init__(
+        self,
+        link: Link,
+        *,
+        timeout_s: float,
+        gap_s: float = RTU_GAP_S,
+        quarantine_s: float = 0.1,
+        is_clear: bool = False,
+    ) -> None:
         super().__init__(link, timeout_s=timeout_s)
         self._gap_s = gap_s
         self._quarantine_s = quarantine_s
+        self._is_clear = is_clear
         self._quiet_since_s = 0.0
         self._unanswered: set[tuple[int, int]] = set()  # (unit, function)
+        self._met: set[int] = set()  # units whose answers are known to be of this session
 
     @property
     def attempt_s(self) -> float:
         """Return the time of quarantine, probe and the attempt itself, in seconds."""
         return 2.0 * self._timeout_s + self._quarantine_s
 
-    def _exchange(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes:
-        if self._unanswered:
-            self._clean(unit, head[0], until_s)
-        return self._transact(unit, request, head, rest, until_s)
+    def identity(self, unit: int, until_s: float) -> Identity | None:
+        """Return vendor, product and revision; the probe before the first request asks for them."""
+        if unit in self._met or self._is_clear:
+            return super().identity(unit, until_s)
+        with contextlib.suppress(NoAnswer):
+            self._clean(unit, self._pdus.read_identity(), until_s)
+        return self._identities.get(unit)
 
-    def _clean(self, unit: int, function: int, until_s: float) -> None:
+    def _exchange(self, unit: int, question: Question, until_s: float) -> ModbusPDU:
+        if self._unanswered or not (self._is_clear or unit in self._met):
+            self._clean(unit, question, until_s)
+        return self._transact(unit, question, until_s)
+
+    def _clean(self, unit: int, question: Question, until_s: float) -> None:
         """Wait out the quarantine, then send a probe whose answer cannot be confused with a lost one."""
         end_s = min(self.asked_s + self._timeout_s + self._quarantine_s, until_s)
-        while now_s() < end_s:
+        while self._unanswered and now_s() < end_s:
             late = self._link.read(end_s)
             self.late_bytes += len(late)
             if len(late) >= 5:  # the late answer itself: the line is clear now
                 break
-        if (unit, function) not in self._unanswered:
+        is_met = self._is_clear or unit in self._met
+        if is_met and (unit, question.function) not in self._unanswered:
             return
-        for other in (READ_HOLDING, READ_INPUT_REGISTERS, READ_INPUTS, READ_COILS):  # some devices have registers only
+        for other in PROBES if is_met else FIRST_PROBES:
             if (unit, other) not in self._unanswered:
                 self._probe(unit, other, until_s)
                 return
-        self._await_life(unit, until_s)
+        self._await_life(unit, question, until_s)
 
-    def _await_life(self, unit: int, until_s: float) -> None:
-        """Wait for a sign of life when every function has an unanswered request.
+    def _await_life(self, unit: int, question: Question, until_s: float) -> None:
+        """Wait for a sign of life when every probe has remained unanswered.
 
-        The device is off, or so slow that any of those answers may still arrive. Ask once more, take any answer only as a
-        sign of life, and wait until the device has sent the rest.
+        The device is off, or knows no other function, or is so slow that any of those answers may still arrive. Ask
+        once, take any answer only as a sign of life, and wait until the device has sent the rest.
 
         Raises:
             NoAnswer: nothing was heard.
         """
-        frame = bytes([unit]) + struct.pack(">BHH", READ_HOLDING, 0, 1)
-        frame += struct.pack("<H", crc_modbus(frame))
-        self.asked_s = now_s()
-        self._link.write(frame, until_s)
+        frame = self._send(unit, question, until_s)
         heard, answer_until_s = b"", self._answer_until(until_s)
         while not heard.removeprefix(frame) and (chunk := self._link.read(answer_until_s)):
             heard += chunk
@@ -242,22 +310,30 @@ class ModbusRtu(ModbusMaster):
                 f"late answers to earlier requests still arrive; `timeout_s` = {self._timeout_s:g} s may be too short"
             )
             raise NoAnswer(f"{self._link.name}, unit {unit}: {late}")
-        self._unanswered = {lost for lost in self._unanswered if lost[0] != unit}
+        self._meet(unit)
 
     def _probe(self, unit: int, function: int, until_s: float) -> None:
-        size = 2 if function >= READ_HOLDING else 1
         with contextlib.suppress(Refused, Busy):  # an exception is an answer too
-            request = struct.pack(">BHH", function, 0, 1)
-            self._transact(unit, request, bytes([function, size]), size, until_s)
+            if function == IDENTIFY:
+                self._identify(unit, until_s, self._transact)
+            elif function >= READ_HOLDING:
+                self._transact(unit, self._pdus.read_registers(function, 0, RARE_COUNT), until_s)
+            else:
+                self._transact(unit, self._pdus.read_bits(function, 0, 8 * RARE_COUNT), until_s)
 
-    def _transact(self, unit: int, request: bytes, head: bytes, rest: int, until_s: float) -> bytes:
-        frame = bytes([unit]) + request
+    def _transact(self, unit: int, question: Question, until_s: float) -> ModbusPDU:
         self._wait_for_gap()
         self.late_bytes += len(drain(self._link))
+        self._send(unit, question, until_s)
+        self._unanswered.add((unit, question.function))
+        return self._listen(unit, question, until_s)
+
+    def _send(self, unit: int, question: Question, until_s: float) -> bytes:
+        frame = bytes([unit]) + question.request
+        frame += struct.pack("<H", crc_modbus(frame))
         self.asked_s = now_s()
-        self._link.write(frame + struct.pack("<H", crc_modbus(frame)), until_s)
-        self._unanswered.add((unit, head[0]))
-        return self._listen(unit, head, rest, until_s)
+        self._link.write(frame, until_s)
+        return frame
 
     def _wait_for_gap(self) -> None:
         while (wait_s := self._quiet_since_s + self._gap_s - now_s()) > 0.0:
@@ -265,17 +341,21 @@ class ModbusRtu(ModbusMaster):
                 self.late_bytes += len(late)
                 self._quiet_since_s = now_s()
 
-    def _find(self, buffer: bytes, unit: int, head: bytes, rest: int) -> bytes | None:
-        good, bad = bytes([unit]) + head, bytes([unit, head[0] | 0x80])
-        for start, size in ((good, len(good) + rest + 2), (bad, 5)):
+    def _find(self, buffer: bytes, unit: int, question: Question) -> bytes:
+        for head, kind in question.forms:
+            start = bytes([unit]) + head
             at = buffer.find(start)
             while at >= 0:
+                size = kind.calculateRtuFrameSize(buffer[at:])
                 frame = buffer[at : at + size]
-                if len(frame) == size and crc_modbus(frame[:-2]) == frame[-2] | frame[-1] << 8:
+                if len(frame) == size > 2 and crc_modbus(frame[:-2]) == frame[-2] | frame[-1] << 8:
                     self._quiet_since_s = now_s()
-                    self._unanswered = {lost for lost in self._unanswered if lost[0] != unit}
-                    if start is bad:
-                        raise exception(unit, head[0], frame[2])
-                    return frame[len(good) : -2]
+                    self._meet(unit)
+                    return frame[1:-2]
                 at = buffer.find(start, at + 1)
-        return None
+        return b""
+
+    def _meet(self, unit: int) -> None:
+        """Record that whatever this unit sends from now on answers a later request."""
+        self._met.add(unit)
+        self._unanswered = {lost for lost in self._unanswered if lost[0] != unit}

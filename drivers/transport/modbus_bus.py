@@ -1,17 +1,20 @@
-"""Creates Modbus buses from options: RTU if `port` is a path, TCP if it is a number; one shared bus per link."""
+"""Modbus devices and their buses: RTU if `port` is a path, TCP if it is a number; one shared bus per link."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from drivers.transport.bus import Bus
-from drivers.transport.link import Link
+from drivers.transport.bus import Bus, PolledDevice
+from drivers.transport.link import Link, now_s
 from drivers.transport.modbus import RTU_GAP_S, ModbusMaster, ModbusRtu, ModbusTcp
 from drivers.transport.options import EitherOptions, PortNumber, Seconds, SerialPath, either_opener
+from hal.errors import DeviceFault
 from hal.registry import Context
 from hal.wires import ResourceClaim
+
+T = TypeVar("T")
 
 
 class ModbusOptions(EitherOptions):
@@ -25,6 +28,14 @@ class ModbusOptions(EitherOptions):
     timeout_s: Annotated[Seconds, Field(description="wait for one answer")] = 0.1
     gap_s: Annotated[float, Field(ge=0, le=0.1, description="silence between two frames of RTU")] = RTU_GAP_S
     max_age_s: Annotated[Seconds, Field(description="an older sample is not returned")] = 0.1
+    product: Annotated[
+        str | None,
+        Field(
+            min_length=1,
+            description="part of the vendor, product or revision that the device must report by function 43/14; "
+            "another device on the port, or one that reports none, is refused",
+        ),
+    ] = None
 
     @model_validator(mode="after")
     def _is_somewhere(self) -> Self:
@@ -51,3 +62,30 @@ def modbus_bus(context: Context, options: ModbusOptions) -> Bus[ModbusMaster]:
         return Bus(name, open_link=opener, client=client)
 
     return context.shared.get(f"modbus {name}", make)
+
+
+class ModbusDevice(PolledDevice[T, ModbusMaster]):
+    """Device on a Modbus bus; it is asked who it is, and then as its driver defines."""
+
+    def __init__(self, context: Context, options: ModbusOptions) -> None:
+        bus = modbus_bus(context, options)
+        super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
+        self._unit = options.unit
+        self._product = options.product
+
+    def set_up(self, client: ModbusMaster) -> None:
+        """Ask who the device is, compare that with the option `product`, and prepare it."""
+        identity = client.identity(self._unit, now_s() + client.attempt_s)
+        self.identified = str(identity or "")
+        if self._product is not None and self._product not in self.identified:
+            says = f"says that it is {self.identified!r}" if identity else "does not say what it is (function 43/14)"
+            raise DeviceFault(
+                f"{self.name}: unit {self._unit} {says}, not {self._product!r}",
+                hint="check port and unit number, or correct the option `product`",
+                device=self.name,
+                link=self.link_name(),
+            )
+        self.prepare(client)
+
+    def prepare(self, client: ModbusMaster) -> None:
+        """Configure the device; called again after each loss of the bus. Nothing is to be done unless overridden."""

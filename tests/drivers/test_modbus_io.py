@@ -11,7 +11,7 @@ from drivers.emulators import modbus_io as emulator
 from drivers.emulators.scripted import ScriptedLights, ScriptedProximity, ScriptedTouch
 from drivers.modbus_io import LightsOptions
 from hal.conformance import LightsContract, ProximityContract, Rig, TouchContract
-from hal.errors import ConfigError, DeviceFault, DeviceTimeout
+from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality
 from hal.registry import Context, connect
 from tests.drivers.rigs import soon, until, wired, wired_rig
@@ -73,6 +73,16 @@ def test_the_devices_error_report_is_a_fault(transport: str) -> None:
         with pytest.raises(DeviceFault, match="no such address") as caught:
             device.set_on([True] * 4, deadline=soon())
         assert caught.value.details["code"] == 2
+
+
+def test_the_device_says_who_it_is_and_another_one_is_refused(transport: str) -> None:
+    far_side = emulator.start(ScriptedLights(), {"transport": transport})
+    with wired(far_side, "modbus:lights", {"product": "modbus_io 1."}) as device:
+        assert "; panelwright modbus_io 1.0; " in device.health().detail
+    far_side = emulator.start(ScriptedLights(), {"transport": transport})
+    said = r"says that it is 'panelwright modbus_io 1.0', not 'ioLogik'"
+    with pytest.raises(DeviceUnavailable, match=said), wired(far_side, "modbus:lights", {"product": "ioLogik"}):
+        pass
 
 
 def test_an_open_stop_circuit_degrades_the_feedback(transport: str) -> None:
@@ -161,8 +171,8 @@ def test_a_host_alone_is_modbus_tcp_at_its_usual_port_and_no_address_is_refused(
         connect(Context(name="io"), "modbus:lights", {})
 
 
-def test_pymodbus_proves_the_emulator(transport: str) -> None:
-    """A third-party client reads the registers that the notes describe."""
+def test_pymodbus_reads_the_registers_that_the_notes_describe(transport: str) -> None:
+    """Its client and its server classes share their encoding; minimalmodbus checks that (see test_other_sides)."""
     lights = ScriptedLights()
     far_side = emulator.start(lights, {"transport": transport})
     if transport == "tcp":
@@ -182,6 +192,10 @@ def test_pymodbus_proves_the_emulator(transport: str) -> None:
         assert client.read_coils(0, count=8, device_id=1).bits[:4] == [True] * 4
         assert client.read_input_registers(0x10, count=2, device_id=1).registers == [0, 1]
         assert client.read_coils(7, count=2, device_id=1).exception_code == 2
+        assert not client.write_register(0x20, 0b0101, device_id=1).isError()
+        assert lights.on == (True, False, True, False)
+        names = client.read_device_information(device_id=1).information
+        assert names == {0: b"panelwright", 1: b"modbus_io", 2: b"1.0"}
     finally:
         client.close()
         far_side.close()

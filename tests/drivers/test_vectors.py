@@ -54,7 +54,7 @@ class OneAnswer:
 
 
 def rtu(link: OneAnswer) -> ModbusRtu:
-    return ModbusRtu(link, timeout_s=0.01, gap_s=0.0)
+    return ModbusRtu(link, timeout_s=0.01, gap_s=0.0, is_clear=True)
 
 
 def ask(master: ModbusMaster, e: dict[str, Any]) -> None:

@@ -10,12 +10,14 @@ from __future__ import annotations
 import struct
 import threading
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.cia402.setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
+from drivers.cia402.objects import faults_of, parameters_of, read_eds
+from drivers.cia402.setup import PROBES, SDO_REQUEST, SDO_S, Parameter, SdoClient, SetUp, upload_request
 from drivers.cia402.states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
 from drivers.cia402.sync import SyncCount
 from drivers.kinds.arms import KinematicsOptions, SetPointFilter, capabilities, require_stations
@@ -66,6 +68,17 @@ class Cia402Options(CanOptions):
     degrees_per_increment: Annotated[
         float, Field(gt=0, description="angle of one increment of the drives' position")
     ] = 0.001
+    eds: Annotated[
+        Path | None,
+        Field(description="electronic data sheet of the drives (EDS or DCF file), against which objects are checked"),
+    ] = None
+    parameters: Annotated[
+        dict[str, int | Annotated[float, Field(allow_inf_nan=False)]],
+        Field(
+            description="objects that are written to every drive before it starts, by number (`6065`, `60C2:1`) or, with "
+            "`eds`, by name (`Interpolation time period.Interpolation time period value`)"
+        ),
+    ] = {}
     kinematics: Annotated[KinematicsOptions, Field(description="links, limits and speeds of the arm")]
 
     def known_arm(self) -> ArmCapabilities:
@@ -78,6 +91,19 @@ class Cia402Options(CanOptions):
         if self.host_node in self.nodes:
             raise ValueError(f"host_node {self.host_node} is also in nodes: give it a number that no drive has")
         return self
+
+    @model_validator(mode="after")
+    def _objects_fit(self) -> Self:
+        drive = None if self.eds is None else read_eds(self.eds)
+        unfit = [] if drive is None else [f"eds: {fault}" for fault in faults_of(drive, bitrate=self.bitrate)]
+        unfit += [f"parameters: {fault}" for fault in parameters_of(self.parameters, drive)[1]]
+        if unfit:
+            raise ValueError("; ".join(unfit))
+        return self
+
+    def written(self) -> list[Parameter]:
+        """Return the objects of `parameters`."""
+        return parameters_of(self.parameters, None if self.eds is None else read_eds(self.eds))[0]
 
     @property
     def stations(self) -> tuple[str, ...]:
@@ -127,6 +153,7 @@ class Cia402(StreamDevice[JointState]):
             options.nodes,
             consumer=options.host_node << 16 | round(1000 * options.heartbeat_s),
             producer_ms=round(500 * options.heartbeat_s),
+            parameters=options.written(),
         )
         self._axes = {node: Axis() for node in options.nodes}
         self._targets = dict.fromkeys(options.nodes, 0)

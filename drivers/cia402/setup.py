@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.transport.can_frames import CanFrame, record, records
@@ -37,11 +38,25 @@ def upload_request(index: int, sub: int) -> bytes:
     return struct.pack("<BHB4x", 0x40, index, sub)
 
 
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """Object to write to every drive; without `data`, `value` is written in the size that the object has."""
+
+    index: int
+    sub: int
+    value: int
+    data: bytes | None
+
+
 class Objects(Protocol):
     """Reads and writes objects of the drives."""
 
     def upload(self, node: int, index: int, sub: int) -> int:
         """Return the value of an object, unsigned."""
+        ...
+
+    def read(self, node: int, index: int, sub: int) -> bytes:
+        """Return the bytes of an object."""
         ...
 
     def download(self, node: int, index: int, sub: int, data: bytes) -> None:
@@ -69,11 +84,14 @@ class SdoClient:
 
     def upload(self, node: int, index: int, sub: int) -> int:
         """Return the value of an object, unsigned."""
+        return int.from_bytes(self.read(node, index, sub), "little")
+
+    def read(self, node: int, index: int, sub: int) -> bytes:
+        """Return the bytes of an object."""
         answer = self._transfer(node, upload_request(index, sub), UPLOADED)
         if not answer[0] & EXPEDITED:
-            return int.from_bytes(self._segments(node), "little")
-        size = 4 - (answer[0] >> 2 & 3)
-        return int.from_bytes(answer[4 : 4 + size], "little")
+            return self._segments(node)
+        return answer[4 : 8 - (answer[0] >> 2 & 3)]
 
     def download(self, node: int, index: int, sub: int, data: bytes) -> None:
         """Write an object of up to four bytes."""
@@ -132,9 +150,12 @@ class SetUp:
     Args:
         consumer: value of 1016h:1, the host's node id and its time-out.
         producer_ms: period of the drive's own heartbeat.
+        parameters: further objects to write, in this order.
     """
 
-    def __init__(self, nodes: Iterable[int], *, consumer: int, producer_ms: int) -> None:
+    def __init__(
+        self, nodes: Iterable[int], *, consumer: int, producer_ms: int, parameters: Iterable[Parameter] = ()
+    ) -> None:
         self._consumer = consumer
         self._done = dict.fromkeys(nodes, 0)
         self._restarts = 0
@@ -142,6 +163,7 @@ class SetUp:
             lambda sdo, node: sdo.download(node, CONSUMER, 1, struct.pack("<I", consumer)),
             lambda sdo, node: sdo.download(node, PRODUCER, 0, struct.pack("<H", producer_ms)),
             lambda sdo, node: sdo.download(node, MODE, 0, struct.pack("<b", CSP)),
+            *map(_writing, parameters),
             *(self._mapping_check(index, sub) for index in MAPPINGS for sub in (1, 2)),
         )
 
@@ -176,3 +198,20 @@ class SetUp:
                 )
 
         return check
+
+
+def _writing(parameter: Parameter) -> Callable[[Objects, int], None]:
+    """Return the step that writes one object."""
+    index, sub, value, data = parameter.index, parameter.sub, parameter.value, parameter.data
+
+    def write(sdo: Objects, node: int) -> None:
+        size = len(data) if data is not None else len(sdo.read(node, index, sub))
+        try:
+            sdo.download(node, index, sub, data or value.to_bytes(size, "little", signed=value < 0))
+        except OverflowError as error:
+            what = f"node {node}: {value} does not fit into object {index:04X}h:{sub}, which has {size} bytes"
+            raise Refused(
+                what, code=index, hint="correct `parameters`; with `eds` they are checked beforehand"
+            ) from error
+
+    return write

@@ -170,6 +170,8 @@ def _type(annotation: Any, metadata: list[Any]) -> tuple[str, str, type[BaseMode
     if get_origin(annotation) is tuple:
         words, limits, below = _type(get_args(annotation)[0], [])
         return f"list of {MANY.get(words, words)}", f"each {limits}" if limits else "", below
+    if get_origin(annotation) is dict:
+        return "table", "", None
     if get_origin(annotation) is Literal:
         return "choice", ", ".join(_toml(each) for each in get_args(annotation)), None
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):

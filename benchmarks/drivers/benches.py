@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from benchmarks.drivers.truths import (
     MovingArm,
     TimedForceTorque,
+    TimedTouch,
+    is_near,
     scip_angles,
     sick_angles,
     taken_s,
     true_centimetres,
+    true_contacts,
     true_distance,
     true_express,
     true_joints,
@@ -27,6 +30,7 @@ from drivers.emulators import (
     bota,
     cia402,
     dynamixel,
+    dynamixel_gripper,
     ft300,
     lms200,
     modbus_io,
@@ -38,6 +42,7 @@ from drivers.emulators import (
     tfmini,
     tfmini_i,
     ur,
+    ur_io,
 )
 from drivers.emulators.base import WireEmulator
 from drivers.emulators.faults import WireFault
@@ -58,6 +63,9 @@ class Bench:
     faults: tuple[WireFault, ...] = tuple(WireFault)
     taken_s: Callable[[Any, Any], float] | None = None
     """Returns when a value was taken (monotonic clock); None if the value or the protocol does not reveal it."""
+    stamps: Literal["log", "own log", "taken"] | None = "log"
+    """What time stamps are compared with: the log of sent frames of an emulator in another process or in the driver's,
+    `taken_s`, or nothing (many frames make one value)."""
 
 
 WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
@@ -93,6 +101,7 @@ BENCHES = (
         is_true=true_centimetres,
         far_options={"transport": "virtual"},
         faults=WITHOUT_CRC,
+        stamps="own log",
     ),
     Bench(
         name="ft300 stream",
@@ -108,6 +117,7 @@ BENCHES = (
         driver="modbus:ft300",
         taken_s=taken_s,
         is_true=true_wrench,
+        stamps="taken",
     ),
     Bench(
         name="robotiq_2f",
@@ -138,6 +148,8 @@ BENCHES = (
         backing=TimedForceTorque,
         driver="udp:netft",
         is_true=true_wrench,
+        taken_s=taken_s,
+        stamps="taken",
     ),
     Bench(
         name="bota",
@@ -179,6 +191,7 @@ BENCHES = (
         options={"scan_rate_hz": 20.0},
         far_options={"scan_rate_hz": 40.0},
         faults=WITHOUT_CRC,
+        stamps=None,
     ),
     Bench(
         name="rplidar express",
@@ -188,6 +201,7 @@ BENCHES = (
         is_true=true_express,
         options={"scan_rate_hz": 20.0, "mode": "express"},
         far_options={"scan_rate_hz": 40.0, "nodes": 384},
+        stamps=None,
     ),
     Bench(
         name="ur",
@@ -197,6 +211,7 @@ BENCHES = (
         taken_s=taken_s,
         is_true=true_joints,
         options={"rate_hz": 125.0},
+        stamps="taken",
     ),
     Bench(
         name="cia402",
@@ -205,6 +220,7 @@ BENCHES = (
         driver="can:cia402",
         taken_s=taken_s,
         is_true=true_joints,
+        stamps="taken",
     ),
     Bench(
         name="cia402 virtual",
@@ -214,6 +230,7 @@ BENCHES = (
         taken_s=taken_s,
         is_true=true_joints,
         far_options={"transport": "virtual"},
+        stamps="taken",
     ),
     Bench(
         name="dynamixel",
@@ -222,6 +239,43 @@ BENCHES = (
         driver="serial:dynamixel",
         taken_s=taken_s,
         is_true=true_joints,
+    ),
+    Bench(
+        name="modbus_io touch",
+        start=modbus_io.start,
+        backing=TimedTouch,
+        driver="modbus:touch",
+        is_true=true_contacts,
+        far_options={"transport": "tcp"},
+    ),
+    Bench(
+        name="modbus_io switch",
+        start=modbus_io.start,
+        backing=lambda: scripted.ScriptedProximity(fixed_m=0.01),
+        driver="modbus:proximity",
+        is_true=is_near,
+        far_options={"transport": "rtu"},
+    ),
+    Bench(
+        name="ur lights",
+        start=ur_io.start,
+        backing=scripted.ScriptedLights,
+        driver="ur:lights",
+        is_true=true_lights,
+    ),
+    Bench(
+        name="ur touch",
+        start=ur_io.start,
+        backing=TimedTouch,
+        driver="ur:touch",
+        is_true=true_contacts,
+    ),
+    Bench(
+        name="dynamixel gripper",
+        start=dynamixel_gripper.start,
+        backing=lambda: scripted.ScriptedGripper(object_m=0.04),
+        driver="serial:dynamixel_gripper",
+        is_true=true_width,
     ),
 )
 

@@ -6,6 +6,7 @@ import multiprocessing
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any
@@ -16,6 +17,7 @@ from drivers.emulators.faults import WireFault
 from hal.errors import CellError
 from hal.readings import Quality, Stamped
 
+RATES = (3, 20)  # a fault in every 3rd and every 20th frame
 MIXED = "mixed"  # a random one of the device's faults each time
 SLACK_S = 0.05
 BEAT_S = 0.005
@@ -75,20 +77,29 @@ class StallProbe:
         self._thread.join()
 
 
+Key = tuple[str, str, int]  # name of the test setup, fault, every how manyth frame
+
+
 def part_faults(seconds: float) -> None:
     """Run all cells; print one line per device and fault rate, and each cell with defects or without a good sample."""
-    keys = [(item.name, fault, every) for item in BENCHES for every in (3, 20) for fault in (*item.faults, MIXED)]
+    started_s = time.monotonic()
+    cells = matrix(BENCHES, seconds)
+    for item in BENCHES:
+        for every in RATES:
+            _row(item, every, {str(fault): cells[item.name, str(fault), every] for fault in (*item.faults, MIXED)})
+    print(f"    {len(cells)} cells of {seconds:.0f} s in {time.monotonic() - started_s:.0f} s of wall time")
+
+
+def matrix(items: Iterable[Bench], seconds: float) -> dict[Key, Cell]:
+    """Run every cell of some test setups; returns the counts by name, fault and rate."""
+    keys = [(item.name, str(fault), every) for item in items for every in RATES for fault in (*item.faults, MIXED)]
     order = sorted(keys, key=lambda key: (key[1], key[2], key[0]))  # a batch mixes light and heavy devices
     batches = [order[i : i + AT_ONCE] for i in range(0, len(order), AT_ONCE)]
-    cells: dict[tuple[str, str, int], Cell] = {}
-    started_s = time.monotonic()
+    cells: dict[Key, Cell] = {}
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
         for batch, found in zip(batches, pool.map(run_batch, batches, [seconds] * len(batches)), strict=True):
             cells.update(zip(batch, found, strict=True))
-    for item in BENCHES:
-        for every in (3, 20):
-            _row(item, every, {fault: cells[item.name, fault, every] for fault in (*item.faults, MIXED)})
-    print(f"    {len(cells)} cells of {seconds:.0f} s in {time.monotonic() - started_s:.0f} s of wall time")
+    return cells
 
 
 def _row(item: Bench, every: int, cells: dict[str, Cell]) -> None:
@@ -105,7 +116,7 @@ def _row(item: Bench, every: int, cells: dict[str, Cell]) -> None:
         print(f"    {total.stalled} more calls were late while the machine did not run this process")
 
 
-def run_batch(batch: list[tuple[str, str, int]], seconds: float) -> list[Cell]:
+def run_batch(batch: list[Key], seconds: float) -> list[Cell]:
     """Run some cells at the same time, in a worker process."""
     sys.setswitchinterval(0.001)
     probe = StallProbe()

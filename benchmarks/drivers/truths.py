@@ -58,6 +58,22 @@ class TimedForceTorque(scripted.ScriptedForceTorque):
         return self._read_s[-1 - ago]
 
 
+class TimedTouch(scripted.ScriptedTouch):
+    """Touch pads whose four patterns follow each other, each for `STEP_S`."""
+
+    STEP_S = 0.25
+
+    def pattern(self, at_s: float) -> tuple[bool, bool]:
+        """Return the contacts at a time of the monotonic clock."""
+        index = int(at_s / self.STEP_S) % 4
+        return bool(index & 1), bool(index & 2)
+
+    def read_contacts(self, *, deadline: Deadline) -> Stamped[tuple[bool, ...]]:
+        """Return the contacts of this moment."""
+        self.contacts = self.pattern(time.monotonic())
+        return super().read_contacts(deadline=deadline)
+
+
 def taken_s(value: Any, backing: Any) -> float:
     """Return when a value was taken, as the backing device stored it."""
     when_s: float = backing.taken_s(value)
@@ -146,3 +162,14 @@ def true_width(value: Any, backing: Any) -> bool:
 def true_lights(value: Any, backing: Any) -> bool:
     """Return whether the value equals the lights that are on."""
     return bool(value == backing.on)
+
+
+def true_contacts(value: Any, backing: Any) -> bool:
+    """Return whether the value was true at a time within the last two patterns."""
+    now_s = time.monotonic()
+    return any(value == backing.pattern(now_s - steps * backing.STEP_S) for steps in range(3))
+
+
+def is_near(value: float, backing: Any) -> bool:  # noqa: ARG001  # the switch knows one distance only
+    """Return whether a closed switch gives its switching distance."""
+    return abs(value - 0.02) < 1e-9

@@ -91,6 +91,7 @@ def test_frames_decode_to_what_was_encoded(values: list[int]) -> None:
     np.testing.assert_allclose(decoded.torque_nm * 1000, values[3:], atol=1e-9)
 
 
+@pytest.mark.third_party("pymodbus", "modbus:ft300")
 def test_pymodbus_reads_the_emulators_registers() -> None:
     backing = ScriptedForceTorque()
     far_side = emulator.start(backing, {})

@@ -171,6 +171,7 @@ def test_a_host_alone_is_modbus_tcp_at_its_usual_port_and_no_address_is_refused(
         connect(Context(name="io"), "modbus:lights", {})
 
 
+@pytest.mark.third_party("pymodbus", "modbus:lights", "modbus:touch", "modbus:proximity")
 def test_pymodbus_reads_the_registers_that_the_notes_describe(transport: str) -> None:
     """Its client and its server classes share their encoding; minimalmodbus checks that (see test_other_sides)."""
     lights = ScriptedLights()

@@ -90,6 +90,7 @@ def test_a_weak_echo_is_invalid() -> None:
     assert (sample.quality, sample.cause) == (Quality.INVALID, Cause.OUT_OF_RANGE)
 
 
+@pytest.mark.third_party("pymodbus", "modbus:tfmini")
 def test_pymodbus_reads_the_registers() -> None:
     far_side = emulator.start_modbus(ScriptedProximity(fixed_m=0.5), {})
     client: Any = ModbusSerialClient(far_side.address["port"], baudrate=115_200, timeout=2)
@@ -103,6 +104,7 @@ def test_pymodbus_reads_the_registers() -> None:
         far_side.close()
 
 
+@pytest.mark.third_party("python-can", "can:tfmini")
 def test_python_can_hears_the_frames() -> None:
     far_side = emulator.start_can(ScriptedProximity(fixed_m=0.5), {})
     try:

@@ -207,6 +207,7 @@ def test_a_missing_node_is_named() -> None:
         far_side.close()
 
 
+@pytest.mark.third_party("canopen", "can:cia402")
 def test_python_can_and_canopen_drive_the_emulator() -> None:
     """The emulator works with a third-party stack: NMT, SDO read, write and abort, 402 states, PDOs on SYNC."""
     arm = ScriptedArm()

@@ -76,6 +76,7 @@ def is_a_scan(range_m: Any, angle_rad: Any, *, step_m: float) -> bool:
     return any(np.allclose(range_m, m, atol=step_m) for m in true_m)
 
 
+@pytest.mark.third_party("hokuyolx", "scip:scanner")
 def test_hokuyolx_reads_parameters_and_scans() -> None:
     hokuyolx: Any = pytest.importorskip("hokuyolx")
     # One scan per 67 ms: if two arrive between its reads, this client takes them for one and reports a wrong checksum.
@@ -98,6 +99,7 @@ def test_hokuyolx_reads_parameters_and_scans() -> None:
         far_side.close()
 
 
+@pytest.mark.third_party("rplidar-roboticia", "serial:rplidar")
 @pytest.mark.parametrize("mode", ["normal", "express"])
 def test_rplidar_roboticia_reads_identity_health_and_nodes(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module: Any = pytest.importorskip("rplidar")
@@ -128,6 +130,7 @@ def is_seen(turn: Any) -> bool:
     return is_a_scan(away_from_seam[:, 1] / 1000, angle_rad, step_m=0.0021)
 
 
+@pytest.mark.third_party("ur-rtde", "ur:rtde")
 def test_ur_rtde_reads_the_arm_and_asks_the_dashboard() -> None:
     """The clients hold the interpreter lock while they connect, so they run in a separate process."""
     pytest.importorskip("rtde_receive")
@@ -146,6 +149,7 @@ def test_ur_rtde_reads_the_arm_and_asks_the_dashboard() -> None:
         far_side.close()
 
 
+@pytest.mark.third_party("mrpt-apps", "serial:lms200")
 def test_rawlog_grabber_sets_up_the_lms_200_and_records_its_scans(tmp_path: Path) -> None:
     """The MRPT grabber finds the power-up baud rate, changes it, sets millimetres and streams; it needs a terminal."""
     if shutil.which("rawlog-grabber") is None:

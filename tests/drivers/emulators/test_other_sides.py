@@ -26,6 +26,7 @@ def test_libscrc_agrees(data: bytes) -> None:
     assert crc_dynamixel(data) == libscrc.buypass(data)
 
 
+@pytest.mark.third_party("dynamixel-sdk", "serial:dynamixel")
 def test_dynamixel_sdk_reads_writes_and_sync_reads() -> None:
     sdk: Any = pytest.importorskip("dynamixel_sdk")
     sdk.port_handler.LATENCY_TIMER = 500  # ms; the default of 16 ms is too short on a busy machine
@@ -60,6 +61,7 @@ def test_dynamixel_sdk_reads_writes_and_sync_reads() -> None:
         far_side.close()
 
 
+@pytest.mark.third_party("minimalmodbus", "modbus:ft300", "modbus:robotiq_2f")
 def test_minimalmodbus_reads_the_sensor_and_works_the_gripper() -> None:
     minimalmodbus: Any = pytest.importorskip("minimalmodbus")
     sensor, gripper = ft300.start(ScriptedForceTorque(), {}), robotiq_2f.start(ScriptedGripper(), {})
@@ -83,6 +85,7 @@ def test_minimalmodbus_reads_the_sensor_and_works_the_gripper() -> None:
         gripper.close()
 
 
+@pytest.mark.third_party("NetFT", "udp:netft")
 def test_netft_reads_a_record() -> None:
     module: Any = pytest.importorskip("NetFT")
     far_side = netft.start(ScriptedForceTorque(), {"udp_port": 49_152})

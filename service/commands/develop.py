@@ -36,6 +36,9 @@ def conform(
     report: Annotated[
         Path | None, typer.Option(help="Path of the report without suffix; runs/conform-CELL if not given.")
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Folder of drivers' records (JSON), to which the results are added.")
+    ] = None,
     seed: SeedOption = None,
 ) -> None:
     """Run the conformance tests on the devices of a cell, and write a report (Markdown and JSON)."""
@@ -52,8 +55,8 @@ def conform(
                 f"{loaded.path} has no device {name!r}", hint=f"devices: {', '.join(loaded.file.devices)}"
             )
     stem = report or Path("runs") / f"conform-{loaded.name}"
-    code = run(loaded, devices=device or (), level=str(level), report=stem)
-    console.print(f"report: {stem}.md, {stem}.json")
+    code = run(loaded, devices=device or (), level=str(level), report=stem, record=record)
+    console.print(f"report: {stem}.md, {stem}.json{'' if record is None else f'; records: {record}'}")
     raise typer.Exit(code)
 
 

@@ -53,11 +53,14 @@ class Bench:
         self._closers.clear()
 
 
-def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None = None) -> int:
+def run(
+    cell: Cell, *, devices: Sequence[str], level: str, report: Path | None = None, record: Path | None = None
+) -> int:
     """Test the named devices (all when empty) up to a level; returns pytest's exit code, or 130 after Ctrl-C.
 
     Args:
         report: path without suffix under which the results are written as `.md` and `.json`.
+        record: folder of the records of drivers, to which the results are added.
 
     Raises:
         ConfigError: pytest is not installed, or the report cannot be written.
@@ -79,6 +82,10 @@ def run(cell: Cell, *, devices: Sequence[str], level: str, report: Path | None =
         code = int(pytest.main([str(path), *options], plugins=[notebook]))
     if report is not None:
         write_report(report, cell, names, notebook)
+    if record is not None:
+        from service.commissioning.conform_record import update_records
+
+        update_records(record, cell, names, notebook)
     return 128 + signal.SIGINT if notebook.is_stopped else code  # pytest's 2 may also mean a file that it cannot load
 
 

@@ -16,6 +16,7 @@ from hal.config import load_cell
 from hal.errors import ConfigError
 from service.commissioning.conform import run
 from service.commissioning.conform_report import Notebook
+from service.commissioning.driver_records import DriverRecord, parse_record
 from tests.service.conftest import WriteCell
 
 ROOT = Path(__file__).parents[3]
@@ -82,12 +83,16 @@ def test_what_ctrl_c_came_before_is_not_tried_and_said_so(tmp_path: Path) -> Non
 
 
 def test_the_wire_of_an_emulated_device_is_broken_too(tmp_path: Path) -> None:
-    done, found, text = conform(ROOT / "cells" / "mixed.toml", tmp_path / "mixed", "--device", "proximity_left")
+    chosen = ("--device", "proximity_left", "--record", str(tmp_path))
+    done, found, text = conform(ROOT / "cells" / "mixed.toml", tmp_path / "mixed", *chosen)
     device = found["devices"]["proximity_left"]
     assert done.returncode == 0, done.stdout[-3000:]
     assert device["counts"] == {"passed": len(device["promises"])}, "the emulator vanishes and falls silent on demand"
     assert device["link"].startswith("serial ")
     assert "| proximity_left | proximity | serial:tfmini | emulator tfmini |" in text
+    record = record_in(tmp_path)
+    assert record.conformance is not None and record.conformance.passed == len(device["promises"])
+    assert record.hardware == (), "an emulator is no hardware"
 
 
 def test_a_real_device_that_cannot_be_broken_is_skipped_with_the_reason(write_cell: WriteCell, tmp_path: Path) -> None:
@@ -96,8 +101,16 @@ def test_a_real_device_that_cannot_be_broken_is_skipped_with_the_reason(write_ce
         port = far_side.address["port"]
         extra = f'[devices.left]\nkind = "proximity"\ndriver = "serial:tfmini"\noptions = {{ port = "{port}" }}\n'
         path = write_cell(mode="real", extra=extra)
-        _, found, _ = conform(path, tmp_path / "real", "--device", "left")
+        _, found, _ = conform(path, tmp_path / "real", "--device", "left", "--record", str(tmp_path))
     finally:
         far_side.close()
     skipped = {p["promise"]: p["why"] for p in found["devices"]["left"]["promises"] if p["outcome"] == "skipped"}
     assert skipped["silence is a timeout and in time"] == "this rig cannot make a device silent"
+    (report,) = record_in(tmp_path).hardware
+    assert (report.cell, report.level, report.conformance.is_good) == ("cell.toml", "read", True)
+    assert port in report.link and report.conformance.skipped == len(skipped)
+
+
+def record_in(folder: Path) -> DriverRecord:
+    """Return the record of the TFmini-Plus in a folder."""
+    return parse_record((folder / "serial-tfmini.json").read_text(), source="record")

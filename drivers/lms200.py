@@ -20,6 +20,7 @@ from drivers.transport.framing import Framer
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
+from drivers.transport.timebase import FrameTimes
 from hal.readings import Quality
 from hal.registry import Context, takes
 
@@ -112,7 +113,7 @@ class Lms200(LineScanner):
         self._options = options
         self._framer = framer(payload_bytes=2 * beams.count + 4)
         self._bad_before = 0
-        self._last = (b"", 0.0)
+        self._times = FrameTimes(period_s=beams.scan_s, frame_bytes=2 * beams.count + 10)
 
     def start(self, link: Link) -> None:
         """Find the scanner, stop it, change the baud rate, set angles and unit, and start the stream."""
@@ -134,6 +135,7 @@ class Lms200(LineScanner):
             self._ask(link, bytes([WRITE_CONFIG]) + bytes(config), WRITE_CONFIG | 0x80, SET_UP_S)
         self._set_mode(link, bytes([STREAM]))
         self._framer.reset()
+        self._times.reset()
 
     def _set_mode(self, link: Link, mode: bytes, wait_s: float = SLOW_S) -> None:
         answer = self._ask(link, bytes([MODE]) + mode, MODE | 0x80, wait_s)
@@ -188,14 +190,11 @@ class Lms200(LineScanner):
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each complete scan."""
-        for frame in self._framer.feed(chunk):
-            if frame[HEADER_BYTES] == SCAN:
-                self._take(frame, arrived_s)
+        scans = [frame for frame in self._framer.feed(chunk) if frame[HEADER_BYTES] == SCAN]
+        for frame, valid_s in self._times.stamped(scans, arrived_s=arrived_s, byte_s=self.byte_s):
+            self._take(frame, valid_s)
 
-    def _take(self, frame: bytes, arrived_s: float) -> None:
-        if frame == self._last[0] and arrived_s - self._last[1] < 0.3 * (self.beams.scan_s if self.beams else 0.0):
-            return  # repeated telegram
-        self._last = (frame, arrived_s)
+    def _take(self, frame: bytes, valid_s: float) -> None:
         status = frame[-3]
         if status & 7 >= FATAL:
             raise Refused("the scanner reports a fatal error", code=status)
@@ -206,7 +205,7 @@ class Lms200(LineScanner):
         bad, self._bad_before = self._framer.counts.bad - self._bad_before, self._framer.counts.bad
         valid = np.where(range_m <= self.beams.max_range_m, range_m, math.nan)
         quality = {ERROR: Quality.INVALID, WARNING: Quality.DEGRADED}.get(status & 7, Quality.VALID)
-        self.publish_scan(valid, valid_s=arrived_s - len(frame) * self.byte_s, missed=bad, quality=quality)
+        self.publish_scan(valid, valid_s=valid_s, missed=bad, quality=quality)
 
 
 def decode_scan(payload: bytes) -> np.ndarray[Any, np.dtype[np.float64]]:

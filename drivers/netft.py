@@ -15,6 +15,7 @@ from drivers.kinds.force_torque import RangeOptions, capabilities
 from drivers.transport.link import Link, drain_until_quiet, now_s
 from drivers.transport.options import PortNumber, UdpOptions, read_options, udp_opener
 from drivers.transport.stream import StreamDevice
+from drivers.transport.timebase import Pauses
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ForceTorqueCapabilities, Wrench
 from hal.readings import Cause, Quality, Stamped
@@ -59,6 +60,7 @@ class Netft(StreamDevice[Wrench]):
         self._last: int | None = None
         self._last_sample = 0
         self._may_be_new = False
+        self._pauses = Pauses()
 
     def capabilities(self) -> ForceTorqueCapabilities:
         """Return the capabilities given by the options."""
@@ -74,6 +76,7 @@ class Netft(StreamDevice[Wrench]):
         drain_until_quiet(link, quiet_s=0.02, until_s=now_s() + SEND_S)
         link.write(request(STREAM), now_s() + SEND_S)
         self._last = None
+        self._pauses.reset()
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish the record; each datagram holds one, and datagrams of other lengths are ignored."""
@@ -85,6 +88,8 @@ class Netft(StreamDevice[Wrench]):
         if last is not None and sequence <= last:
             return  # repeated or late record
         self._last, self._last_sample = sequence, samples
+        if self._pauses.may_be_held_up(arrived_s, 1):
+            return
         o = self._options
         value = Wrench(
             force_n=np.array(counts[:3], dtype=float) / o.counts_per_n,

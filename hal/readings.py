@@ -41,6 +41,7 @@ class Stamped(Generic[T]):
         host_time_s: when the value was valid, on the cell's clock (monotonic or simulated).
         device_time_s: the device's own stamp, or None when it has no clock.
         sequence: rises by one per sample; a gap means a lost sample.
+        detail: what the quality and the cause leave open, as a sentence for people, for example what is missing.
     """
 
     value: T
@@ -49,6 +50,7 @@ class Stamped(Generic[T]):
     device_time_s: float | None = None
     quality: Quality = Quality.VALID
     cause: Cause = Cause.NONE
+    detail: str = ""
 
     def age_s(self, now_s: float) -> float:
         """Return the seconds since the value was valid."""

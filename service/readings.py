@@ -119,6 +119,7 @@ def as_json(name: str, kind: DeviceKind, snapshot: ReceivedReading) -> dict[str,
         "sequence": stamped.sequence,
         "quality": str(stamped.quality),
         "cause": str(stamped.cause),
+        "detail": stamped.detail,
     }
 
 

@@ -10,7 +10,7 @@ from benchmarks.drivers.report import line
 from drivers import bota, ft300, lms200, scip, tfmini
 from drivers.dynamixel import protocol
 from drivers.rplidar.express import CapsuleParser
-from drivers.rplidar.scanner import NodeParser
+from drivers.rplidar.nodes import NodeParser
 from drivers.transport.framing import Framer
 from drivers.transport.slcan import LineReader
 from drivers.ur import rtde

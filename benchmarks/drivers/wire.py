@@ -12,7 +12,7 @@ from benchmarks.drivers.benches import bench, running
 from benchmarks.drivers.report import cpu_rate, deadline, line, percentiles, rate
 from drivers.emulators import ft300, rplidar, scip, scripted, tfmini
 from drivers.ft300 import stream_framer
-from drivers.rplidar.scanner import decode
+from drivers.rplidar.nodes import decode
 from drivers.scip import decode_ranges_mm
 from drivers.tfmini import data_framer
 from drivers.transport.checks import crc_modbus

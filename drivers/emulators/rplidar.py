@@ -12,6 +12,7 @@ from drivers.emulators.beams import line_m
 from drivers.emulators.faults import FaultOptions
 from drivers.emulators.ports import Peer, PtyPort
 from drivers.rplidar.express import CABIN, CAPSULE_BYTES, POINTS
+from drivers.rplidar.nodes import NODE_BYTES
 from drivers.rplidar.scanner import descriptor
 from drivers.transport.checks import xor_byte
 from hal.devices import Device, RangeScanner
@@ -27,21 +28,23 @@ class RplidarEmulatorOptions(FaultOptions):
 
     scan_rate_hz: Annotated[float, Field(gt=0, le=50)] = 10.0
     nodes: Annotated[int, Field(ge=36, le=3600)] = 360
+    bursts: Annotated[int, Field(ge=1, le=360, description="pieces in which a revolution is sent; faults hit one")] = 1
     health: Annotated[int, Field(ge=0, le=2)] = 0
     is_cured_by_reset: bool = True
 
 
 class RplidarEmulator(WireEmulator):
-    """Running emulator of the scanner; it sends each revolution in one piece."""
+    """Running emulator of the scanner; it measures a revolution at its start, and sends it in bursts."""
 
     def __init__(self, backing: RangeScanner, options: RplidarEmulatorOptions) -> None:
         super().__init__(PtyPort("rplidar"), options, name="rplidar")
         self._backing = backing
         self._o = options
         self.health = options.health
-        self.period_s = 1.0 / options.scan_rate_hz
+        self.period_s = 1.0 / options.scan_rate_hz / options.bursts
         self.is_scanning = self.is_express = self._is_first = False
         self._buffer = b""
+        self._unsent: list[bytes] = []
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
         """Answer the requests; each is `A5 command`, some with a payload."""
@@ -76,11 +79,15 @@ class RplidarEmulator(WireEmulator):
                 return
 
     def on_tick(self) -> None:
-        """Send one revolution while scanning."""
-        if self.is_scanning and self.is_express:
-            self.send(None, self._turn())
-        elif self.is_scanning:
-            self.send(None, self._turn(), protected=slice(0, 0))
+        """Send one burst while scanning."""
+        if not self.is_scanning:
+            self._unsent = []
+            return
+        if not self._unsent:
+            turn, unit = self._turn(), CAPSULE_BYTES if self.is_express else NODE_BYTES
+            size = -(-len(turn) // unit // self._o.bursts) * unit
+            self._unsent = [turn[at : at + size] for at in range(0, len(turn), size)]
+        self.send(None, self._unsent.pop(0), protected=slice(None) if self.is_express else slice(0, 0))
 
     def _turn(self) -> bytes:
         count = self._o.nodes if not self.is_express else -(-self._o.nodes // POINTS) * POINTS

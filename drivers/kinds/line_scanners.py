@@ -91,13 +91,18 @@ class LineScanner(StreamDevice[RangeImage]):
         device_time_s: float | None = None,
         missed: int = 0,
         quality: Quality = Quality.VALID,
+        lacking_rad: float = 0.0,
     ) -> None:
         """Publish one scan, beam by beam, NaN where nothing was seen; `valid_s` is the time of its end.
 
         Args:
             quality: as reported by the device; a scan in which no beam saw anything is always invalid.
+            lacking_rad: angle of which no measurement arrived; such a scan is degraded at best.
         """
-        cause = Cause.NONE if quality is Quality.VALID else Cause.DEVICE
+        cause, detail = Cause.NONE if quality is Quality.VALID else Cause.DEVICE, ""
+        if lacking_rad > 0.0:
+            detail = f"{math.degrees(lacking_rad):.0f} degrees of the scan were lost on the link"
+            quality, cause = (Quality.DEGRADED, Cause.COMM) if quality is Quality.VALID else (quality, cause)
         if not np.any(np.isfinite(range_m)) and quality is not Quality.INVALID:
             quality, cause = Quality.INVALID, Cause.OUT_OF_RANGE
         self.publish(
@@ -106,6 +111,7 @@ class LineScanner(StreamDevice[RangeImage]):
             device_time_s=device_time_s,
             quality=quality,
             cause=cause,
+            detail=detail,
             missed=missed,
         )
         kept, newest = self._kept, self.mailbox.peek()

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,7 +23,8 @@ CAPSULE_BYTES, POINTS = 84, 32
 CABIN = np.dtype([("d1", "<u2"), ("d2", "<u2"), ("offsets", "u1")])
 UNEVEN = 0.3  # fraction by which the spans of neighbours may differ: a motor's speed changes slowly
 NO_RANGE = math.nan
-Points = tuple[Array, Array]
+Points = tuple[Array, Array, Array]
+REMEMBERED = 6  # spans; two of them that agree were of neighbours, even if every third capsule is lost
 
 
 def is_capsule(data: bytes) -> bool:
@@ -40,7 +43,9 @@ def is_first(capsule: bytes) -> bool:
 
 
 def decode_capsule(capsule: bytes, next_start_rad: float) -> Points:
-    """Return angles in radians within one turn, and distances in metres (NaN for none), of the 32 measurements.
+    """Return the 32 measurements: angles without and with their offsets, in radians within one turn, and distances.
+
+    Distances are in metres, NaN for none.
 
     angle_k = start + k / 32 (next start - start) - offset_k.
     """
@@ -50,9 +55,13 @@ def decode_capsule(capsule: bytes, next_start_rad: float) -> Points:
     offset_rad = np.radians((nibbles | (raw & 3) << 4) / 8.0)
     start = start_rad(capsule)
     step_rad = (next_start_rad - start) % math.tau / POINTS
-    angle_rad = np.asarray((start + np.arange(POINTS) * step_rad - offset_rad) % math.tau, np.float64)
+    head_rad = np.asarray(start + np.arange(POINTS) * step_rad, np.float64)
     distance_m = (raw >> 2) / 1000.0
-    return angle_rad, np.where(distance_m > 0.0, distance_m, NO_RANGE)
+    return (
+        head_rad % math.tau,
+        (head_rad - offset_rad) % math.tau,
+        np.where(distance_m > 0.0, distance_m, NO_RANGE),
+    )
 
 
 class CapsuleParser:
@@ -61,7 +70,7 @@ class CapsuleParser:
     def __init__(self) -> None:
         self._buffer = b""
         self._before: bytes | None = None
-        self._span_rad: float | None = None
+        self._spans_rad: deque[float] = deque(maxlen=REMEMBERED)
         self.missteps = 0
 
     def feed(self, chunk: bytes) -> list[Points | None]:
@@ -84,30 +93,38 @@ class CapsuleParser:
         return 0 if self._before is None else POINTS
 
     def _follow(self, capsule: bytes) -> list[Points | None]:
-        """Decode the previous capsule from the arrival of this one; capsules of unequal span are not neighbours."""
+        """Decode the previous capsule; when the next one was lost, by the usual span, because the motor is steady."""
         before, self._before = self._before, capsule
-        if before is None or is_first(capsule):
-            self._span_rad = None
+        if is_first(capsule):
+            self._spans_rad.clear()
             return []
-        last_rad, self._span_rad = self._span_rad, (start_rad(capsule) - start_rad(before)) % math.tau
-        if last_rad is None:
+        if before is None or capsule == before:
             return []
-        if abs(self._span_rad - last_rad) > UNEVEN * last_rad:
-            self.missteps += 1
-            return [None]
-        return [decode_capsule(before, start_rad(capsule))]
+        span_rad = (start_rad(capsule) - start_rad(before)) % math.tau
+        self._spans_rad.append(span_rad)
+        usual_rad = self._usual_rad()
+        if usual_rad is None:
+            self.missteps += len(self._spans_rad) > 1
+            return [None] if len(self._spans_rad) > 1 else []
+        if is_near(span_rad, usual_rad):
+            return [decode_capsule(before, start_rad(capsule))]
+        self.missteps += 1
+        return [decode_capsule(before, start_rad(before) + usual_rad), None]
+
+    def _usual_rad(self) -> float | None:
+        """Return the smallest recent span that has a like, or None before there is one."""
+        spans_rad = sorted(self._spans_rad)
+        return next((a for a, b in pairwise(spans_rad) if is_near(b, a)), None)
 
     def _misstep(self) -> list[Points | None]:
         self.missteps += 1
-        self._before = self._span_rad = None
-        return [None]
+        before, self._before = self._before, None
+        usual_rad = self._usual_rad()
+        if before is None or usual_rad is None:
+            return [None]
+        return [decode_capsule(before, start_rad(before) + usual_rad), None]
 
 
-def split_turns(angle_rad: Array, last_rad: float) -> list[int]:
-    """Return the indices where a new turn begins: the angle falls by more than half a turn.
-
-    Args:
-        last_rad: the angle before the first one, in radians.
-    """
-    fall_rad = -np.diff(angle_rad, prepend=last_rad)
-    return [int(place) for place in np.flatnonzero(fall_rad > math.pi)]
+def is_near(span_rad: float, usual_rad: float) -> bool:
+    """Return whether two spans are those of neighbours."""
+    return abs(span_rad - usual_rad) <= UNEVEN * usual_rad

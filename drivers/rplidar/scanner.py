@@ -1,8 +1,8 @@
 """Slamtec RPLIDAR A1/A2 over serial, standard and express scans (Slamtec interface protocol, LR001).
 
 A measurement of a standard scan has five bytes and no checksum, only a start bit next to its inverse and one bit that
-is always 1. A measurement is therefore accepted only when the next eight are in step too, and a turn with a misstep in
-it is discarded as a whole.
+is always 1. A measurement is therefore accepted only when the next eight are in step too; a misstep leaves a gap in the
+turn. A turn with a gap is given as it is, with quality `degraded` and the missing angle, unless half of it is missing.
 """
 
 from __future__ import annotations
@@ -16,22 +16,20 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.kinds.line_scanners import Beams, LineScanner, within
-from drivers.rplidar.express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points, split_turns
+from drivers.rplidar.express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points
+from drivers.rplidar.nodes import NodeParser, decode
+from drivers.rplidar.turns import LARGEST_AGE, MOST_MISSING_RAD, Measurements, TurnCollector, missing_rad
 from drivers.transport.capture import inside
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.serial_link import SerialLink
+from drivers.transport.timebase import Pauses
 from hal.arrays import Array
 from hal.readings import Quality
 from hal.registry import Context, takes
 
 STOP, RESET, START_SCAN, GET_INFO, GET_HEALTH = 0x25, 0x40, 0x20, 0x50, 0x52
 INFO_TYPE, HEALTH_TYPE, SCAN_TYPE = 0x04, 0x06, 0x81
-NODE_BYTES = 5
-IN_STEP = 8  # a shifted stream passes one test with probability 1/4, eight with 1/65536
-FULL_TURN_Q6 = 360 * 64
-WHOLE_TURN_RAD = math.radians(330)  # a turn that lost its beginning is not published
-JITTER_RAD = math.radians(2.0)
 WARNING, ERROR = 1, 2
 ANSWER_S = (0.3, 0.6, 0.9)  # of each attempt: a slow scanner catches up on repeated requests
 RESET_S = 0.5
@@ -66,74 +64,6 @@ def descriptor(length: int, mode: int, kind: int) -> bytes:
     return struct.pack("<BBIB", 0xA5, 0x5A, length | mode << 30, kind)
 
 
-def begins_node(data: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return, for every index in `data` except the last four, whether a plausible measurement begins there."""
-    start, check = data[:-4] & 3, data[1:-3] & 1
-    angle_q6 = data[1:-3].astype(np.int32) >> 1 | data[2:-2].astype(np.int32) << 7
-    is_good: NDArray[np.bool_] = ((start == 1) | (start == 2)) & (check == 1) & (angle_q6 <= FULL_TURN_Q6)
-    return is_good
-
-
-def decode(nodes: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Return start flags, angles in radians and distances in metres (NaN for none) of (n, 5) measurements."""
-    n = nodes.astype(np.int32)
-    angle_rad = np.radians((n[:, 1] >> 1 | n[:, 2] << 7) / 64.0)
-    distance_m = (n[:, 3] | n[:, 4] << 8) / 4000.0
-    return (n[:, 0] & 1).astype(bool), angle_rad, np.where(distance_m > 0.0, distance_m, math.nan)
-
-
-class NodeParser:
-    """Parses measurements from bytes in chunks of any size; `None` in the result marks a misstep."""
-
-    def __init__(self) -> None:
-        self._buffer = b""
-        self._is_in_step = False
-        self.missteps = 0
-
-    def feed(self, chunk: bytes) -> list[NDArray[np.uint8] | None]:
-        """Return runs of (n, 5) measurements that are now confirmed, separated by missteps."""
-        self._buffer += chunk
-        runs: list[NDArray[np.uint8] | None] = []
-        if len(self._buffer) < NODE_BYTES * (IN_STEP + 1):
-            return runs
-        data = np.frombuffer(self._buffer, np.uint8)
-        good = begins_node(data)
-        at = 0
-        while True:
-            steps = good[at::NODE_BYTES]
-            length = len(steps) if steps.all() else int(np.argmin(steps))
-            trusted = length - IN_STEP
-            if trusted > 0:
-                self._is_in_step = True
-                runs.append(data[at : at + trusted * NODE_BYTES].reshape(-1, NODE_BYTES))
-                at += trusted * NODE_BYTES
-            if length == len(steps):
-                break  # in step up to the end, but the last few are not confirmed yet
-            if self._is_in_step:
-                self.missteps += 1
-                runs.append(None)
-            self._is_in_step = False
-            at = _next_in_step(good, at + 1)
-        self._buffer = self._buffer[at:]
-        return runs
-
-    @property
-    def pending(self) -> int:
-        """Return the number of measurements received but not yet confirmed."""
-        return len(self._buffer) // NODE_BYTES
-
-
-def _next_in_step(good: NDArray[np.bool_], at: int) -> int:
-    """Return the first index from `at` on after which all known bytes stay in step for the confirmation length."""
-    span = NODE_BYTES * IN_STEP
-    padded = np.concatenate((good[at:], np.ones(span, np.bool_)))  # bytes yet to come may still be good
-    ok = padded[: len(good) - at].copy()
-    for k in range(1, IN_STEP + 1):
-        ok &= padded[k * NODE_BYTES : k * NODE_BYTES + len(ok)]
-    places = np.flatnonzero(ok)
-    return at + int(places[0]) if len(places) else len(good)
-
-
 class Rplidar(LineScanner):
     """Slamtec RPLIDAR scanner."""
 
@@ -153,13 +83,13 @@ class Rplidar(LineScanner):
         )
         self.sigma_m = options.sigma_m
         self._is_express = options.mode == "express"
-        self._nodes, self._capsules = NodeParser(), CapsuleParser()
-        self._turn: list[Points] | None = None
+        self._nodes, self._capsules, self._turns = NodeParser(), CapsuleParser(), TurnCollector()
+        self._pauses = Pauses()
+        self._arrived_s = math.inf
         self._turn_s = now_s()
         # The present turn: arrival time of its first chunk, and the number of measurements in that chunk.
         self._begun: tuple[float, int] | None = None
         self._measurement_s = 0.0
-        self._last_rad = 0.0
         self._missed = 0
         self._quality = Quality.VALID
 
@@ -183,7 +113,9 @@ class Rplidar(LineScanner):
             if status == ERROR:
                 raise Refused(f"the scanner reports error {code:04X}h, which a reset did not clear", code=code)
         self._quality = Quality.DEGRADED if status == WARNING else Quality.VALID
-        self._nodes, self._capsules, self._turn, self._begun = NodeParser(), CapsuleParser(), None, None
+        self._nodes, self._capsules, self._turns = NodeParser(), CapsuleParser(), TurnCollector()
+        self._pauses.reset()
+        self._begun, self._arrived_s = None, math.inf
         self._turn_s = now_s() + SPIN_UP_S
         if self._is_express:
             rest = self._ask(link, REQUEST, descriptor(CAPSULE_BYTES, 1, EXPRESS_TYPE), 0, OLD_FIRMWARE)
@@ -209,78 +141,73 @@ class Rplidar(LineScanner):
         raise NoAnswer(f"no answer to command {request[1]:02X}h{remedy}")
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
-        """Collect measurements; a start flag, or an angle that falls back to zero, ends a turn."""
-        batches: list[Any] = (
-            list(self._capsules.feed(chunk)) if self._is_express else [_points(run) for run in self._nodes.feed(chunk)]
-        )
-        behind = self._capsules.pending if self._is_express else self._nodes.pending
-        behind += sum(len(points[-1]) for points in batches if points is not None)
-        for points in batches:
-            if points is None:
-                self._missed += self._turn is not None
-                self._turn = self._begun = None
-                continue
-            self._heard_s = max(self._heard_s, arrived_s)
-            starts, angle_rad, distance_m = points if len(points) == 3 else (self._starts(points[0]), *points)
-            for place, part in enumerate(np.split(np.arange(len(angle_rad)), starts)):
-                if place:
-                    self._finish(arrived_s, behind)
-                    self._turn = []
-                if self._turn is not None and len(part):
-                    self._turn.append((angle_rad[part], distance_m[part]))
-                behind -= len(part)
+        """Collect measurements and publish each complete turn; what may have been held up is left out."""
+        if self._pauses.may_be_held_up(arrived_s, len(chunk)):
+            self._nodes, self._capsules, self._begun = NodeParser(), CapsuleParser(), None
+        else:
+            self._collect(chunk, arrived_s)
+        self._arrived_s = arrived_s
         if arrived_s > self._turn_s + TURN_S:
             raise NoAnswer(
                 f"measurements arrive, but no complete turn in {TURN_S:.0f} s; check that its motor turns steadily"
             )
 
-    def _starts(self, angle_rad: Array) -> list[int]:
-        starts = split_turns(angle_rad, self._last_rad)
-        self._last_rad = float(angle_rad[-1])
-        return starts
+    def _collect(self, chunk: bytes, arrived_s: float) -> None:
+        parser = self._capsules if self._is_express else self._nodes
+        waited = parser.pending  # so many of the next measurements came with an earlier chunk
+        batches = [_points(run) for run in parser.feed(chunk)]
+        turns = []
+        for points in batches:
+            if points is None:
+                self.errors += 1
+                continue
+            self._heard_s = max(self._heard_s, arrived_s)
+            arrivals_s = np.where(np.arange(len(points[0])) < waited, min(self._arrived_s, arrived_s), arrived_s)
+            waited = max(0, waited - len(points[0]))
+            head_rad, angle_rad, distance_m = points
+            new = Measurements(head_rad=head_rad, angle_rad=angle_rad, distance_m=distance_m, arrived_s=arrivals_s)
+            turns += list(self._turns.add(new))
+        for turn, ended in turns:
+            self._finish(turn, arrived_s, self._turns.count - ended + parser.pending)
 
-    def _finish(self, arrived_s: float, behind: int) -> None:
-        """Publish the completed turn.
+    def _finish(self, turn: Measurements, arrived_s: float, behind: int) -> None:
+        """Publish a complete turn, without the measurements that a long gap left behind.
 
         Args:
             arrived_s: when the chunk arrived.
             behind: measurements since the end of the turn, assumed to take as long as those of the turn.
         """
         begun, self._begun = self._begun, (arrived_s, behind)
-        if not self._turn or begun is None or self.beams is None:
+        if self.beams is None:
             return
-        angle_rad, distance_m = (np.concatenate(arrays) for arrays in zip(*self._turn, strict=True))
-        if np.ptp(angle_rad) < WHOLE_TURN_RAD or turns_back(angle_rad):
+        whole = len(turn) / max(1.0 - missing_rad(turn.head_rad) / math.tau, 0.5)
+        if begun is not None and (between := whole + behind - begun[1]) > whole / 2:
+            self._measurement_s = (arrived_s - begun[0]) / between  # over less, the jitter of the arrivals would count
+        each_s = self._measurement_s or self.beams.scan_s / whole
+        ended_s = min(arrived_s - behind * each_s, float(turn.arrived_s[-1]))
+        turn = turn.at(turn.arrived_s > ended_s - LARGEST_AGE * max(whole * each_s, self.beams.scan_s))
+        lacking_rad = missing_rad(turn.head_rad)
+        if lacking_rad > MOST_MISSING_RAD:
             self._missed += 1
             return
-        missed, self._missed = self._missed, 0
-        between = len(angle_rad) + behind - begun[1]  # measurements between the two arrivals
-        if between > len(angle_rad) / 2:  # with fewer, the jitter of the arrivals would dominate
-            self._measurement_s = (arrived_s - begun[0]) / between
-        each_s = self._measurement_s or self.beams.scan_s / len(angle_rad)
+        missed, self._missed = self._missed + self._turns.discarded, 0
+        self._turns.discarded = 0
         self._turn_s = max(self._turn_s, arrived_s)
         self.publish_scan(
-            sectors(angle_rad, within(distance_m, self.beams), self.beams.count),
-            valid_s=arrived_s - behind * each_s,
+            sectors(turn.angle_rad, within(turn.distance_m, self.beams), self.beams.count),
+            valid_s=ended_s,
             missed=missed,
             quality=self._quality,
+            lacking_rad=lacking_rad,
         )
 
 
-def _points(
-    run: NDArray[np.uint8] | None,
-) -> tuple[list[int], Array, Array] | None:
-    """Return the indices of start flags, the angles and the distances of a run of measurements."""
-    if run is None:
-        return None
-    is_start, angle_rad, distance_m = decode(run)
-    return [int(place) for place in np.flatnonzero(is_start)], angle_rad, distance_m
-
-
-def turns_back(angle_rad: Array) -> bool:
-    """Return whether an angle goes back by more than the motor's jitter, as noise taken for a measurement does."""
-    step_rad = (np.diff(angle_rad) + np.pi) % math.tau - np.pi
-    return bool(np.any(step_rad < -JITTER_RAD))
+def _points(run: NDArray[np.uint8] | Points | None) -> Points | None:
+    """Return the measurements of a run of nodes, whose angles are already corrected, or of a capsule."""
+    if not isinstance(run, np.ndarray):
+        return run
+    angle_rad, distance_m = decode(run)
+    return angle_rad, angle_rad, distance_m
 
 
 def sectors(angle_rad: Array, range_m: Array, count: int) -> Array:

@@ -125,6 +125,7 @@ def _imports(k: KindText, wire: Mapping[str, str], driver: str, far_side: str) -
         "drivers.transport.framing": ("Framer",),
         "drivers.transport.link": ("Link", "drain"),
         "drivers.transport.options": (wire["options_base"], wire["opener"], "read_options"),
+        "drivers.transport.timebase": ("FrameTimes",),
         "hal.registry": ("Context", "takes"),
     }
     far: Imports = {

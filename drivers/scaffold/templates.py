@@ -32,24 +32,26 @@ $members
         opener, link_name = $opener(options, context.name)
         super().__init__(context, open_link=opener, link_name=link_name, max_age_s=3.0 / RATE_HZ)
         self._framer = framer()
+        self._times = FrameTimes(period_s=1.0 / RATE_HZ, frame_bytes=FRAME.size)
         self._counter: int | None = None
 
 ${methods}    def start(self, link: Link) -> None:
         """Bring the device from any state to streaming: stop, identify, configure, start. This one needs none of it."""
         drain(link)
         self._framer.reset()
+        self._times.reset()
         self._counter = None
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each complete frame; its counter shows which frames were lost or repeated."""
-        for frame in self._framer.feed(chunk):
+        for frame, valid_s in self._times.stamped(self._framer.feed(chunk), arrived_s=arrived_s, byte_s=self.byte_s):
             _, counter, *numbers, _ = FRAME.unpack(frame)
             gap = 1 if self._counter is None else (counter - self._counter) % 256
             if gap == 0:
                 continue
             self._counter = counter
             value = $decode
-            self.$publish(value, valid_s=arrived_s - len(frame) * self.byte_s, missed=gap - 1)
+            self.$publish(value, valid_s=valid_s, missed=gap - 1)
 
 
 @takes(${cls}Options)

@@ -80,6 +80,7 @@ class WireDevice(Generic[T]):
         device_time_s: float | None = None,
         quality: Quality = Quality.VALID,
         cause: Cause = Cause.NONE,
+        detail: str = "",
         missed: int = 0,
     ) -> None:
         """Publish a new sample to all readers.
@@ -109,6 +110,7 @@ class WireDevice(Generic[T]):
                 device_time_s=device_time_s,
                 quality=quality,
                 cause=cause,
+                detail=detail,
             )
         )
 
@@ -200,7 +202,8 @@ class WireDevice(Generic[T]):
         """Return the state of the link and of the newest sample, without waiting."""
         newest, error = self.mailbox.peek(), self.mailbox.error()
         quality, cause = self._condition(newest, error)
-        told = (self.link_name(), self.identified, self.wire_counts(), error.what if error else "")
+        said = newest.detail if newest else ""
+        told = (self.link_name(), self.identified, self.wire_counts(), error.what if error else said)
         return Health(
             connected=self.is_up() and not self._is_closed,
             quality=quality,

@@ -14,7 +14,8 @@ LATELY = 8  # frames; at least one of this many was not late, and a shift of the
 ALMOST = 0.1  # fraction of a period: jitter of the gap that a lost frame leaves
 LATE_S, SELDOM = 5e-4, 0.2
 PERIOD_OVER_S = 1.0
-PAUSE_S, PAUSE_RATIO = 0.1, 3.0  # a pause is longer than this, and than this multiple of the shortest recent gap
+PAUSE_S, PAUSE_RATIO = 0.1, 1.5  # a pause lacks data for longer than this, and than this multiple of the usual interval
+AT_ONCE = 0.5  # data that come in less than this fraction of the time that they took to measure were waiting
 RESTART_S = 1.0  # a device clock that jumps back or differs from the expected time by this much has been restarted
 LONGEST_AWAY_S = 60.0  # quartz clocks drift apart by 30 ms in that time
 
@@ -118,6 +119,45 @@ class ExchangeTime:
         return asked_s + 0.5 * min(self._lasted_s)
 
 
+class Pauses:
+    """Tells which data of a stream without a clock may have been held up on their way.
+
+    Data that end a pause may be as old as the pause: neither their arrival nor their content shows it. The same holds for
+    data that follow at once, faster than the device measures, until they have made up for the pause. A late reader is no
+    pause, because all that it missed comes in one chunk.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again, because the link was reopened."""
+        self._arrived_s = -math.inf
+        self._intervals: deque[tuple[float, float]] = deque(maxlen=LATELY)  # between chunks, and the same per item
+        self._lacking_s = 0.0
+
+    @property
+    def each_s(self) -> float | None:
+        """Return the usual time between two items, or None before the second chunk."""
+        return _median([each_s for _, each_s in self._intervals]) if self._intervals else None
+
+    def may_be_held_up(self, arrived_s: float, count: int) -> bool:
+        """Return whether a chunk of `count` items (frames, bytes) may be older than its arrival says."""
+        interval_s, each_s = arrived_s - self._arrived_s, self.each_s
+        self._arrived_s = arrived_s
+        if math.isinf(interval_s):
+            return False
+        usual_s = _median([usual_s for usual_s, _ in self._intervals]) if self._intervals else math.inf
+        measured_s = count * (each_s or 0.0)
+        if self._lacking_s > 0.0 and interval_s < AT_ONCE * measured_s:
+            self._lacking_s -= measured_s - interval_s
+            return True
+        self._intervals.append((interval_s, interval_s / count))
+        is_pause = interval_s - measured_s > max(PAUSE_S, PAUSE_RATIO * usual_s)
+        self._lacking_s = interval_s - measured_s if is_pause else 0.0
+        return is_pause
+
+
 class FrameTimes:
     """Stamps the frames of a device that streams without a clock, and drops repeated frames.
 
@@ -127,7 +167,8 @@ class FrameTimes:
         stamp(n) = min_i a_i + (n - n_i) p,  at most one period before its own arrival.
 
     The host is rarely late. If many frames come late, the sender itself is irregular and the arrival times are used.
-    The frame that ends a pause may be as old as the pause, which cannot be detected, so it is dropped.
+    Of several frames in one chunk, all but the last are older by whole periods. Frames that may have been held up are
+    dropped (see `Pauses`).
 
     Args:
         period_s: nominal time between two frames.
@@ -141,32 +182,27 @@ class FrameTimes:
         self._late: deque[bool] = deque(maxlen=8 * LATELY)
         self._stamped_s = -math.inf
         self._last = (b"", -math.inf)
-        self._gaps_s: deque[float] = deque(maxlen=LATELY)
+        self._pauses = Pauses()
 
     def reset(self) -> None:
         """Start again, because the link was reopened."""
         self._arrivals.clear()
         self._late.clear()
         self._last = (b"", -math.inf)
-        self._gaps_s.clear()
+        self._pauses.reset()
 
     def stamped(self, frames: list[bytes], *, arrived_s: float, byte_s: float) -> list[tuple[bytes, float]]:
         """Return each new frame with its time; equal frames at the same moment are one repeated frame."""
-        fresh = []
+        new = []
         for frame in frames:
-            if frame == self._last[0] and arrived_s - self._last[1] < REPEATED * self._nominal_s:
-                continue
-            ends_pause = self._ends_pause(arrived_s)
-            self._last = (frame, arrived_s)
-            if ends_pause:
-                continue
-            fresh.append((frame, self._stamp_s(arrived_s - self._frame_bytes * byte_s)))
-        return fresh
-
-    def _ends_pause(self, arrived_s: float) -> bool:
-        gap_s, shortest_s = arrived_s - self._last[1], min(self._gaps_s, default=math.inf)
-        self._gaps_s.append(gap_s)
-        return gap_s > max(PAUSE_S, PAUSE_RATIO * shortest_s)
+            if frame != self._last[0] or arrived_s - self._last[1] >= REPEATED * self._nominal_s:
+                new.append(frame)
+                self._last = (frame, arrived_s)
+        if not new or self._pauses.may_be_held_up(arrived_s, len(new)):
+            return []
+        each_s, began_s = self._pauses.each_s or self._nominal_s, arrived_s - self._frame_bytes * byte_s
+        ages_s = [each_s * later for later in reversed(range(len(new)))]
+        return [(frame, self._stamp_s(began_s - age_s)) for frame, age_s in zip(new, ages_s, strict=True)]
 
     def _stamp_s(self, arrived_s: float) -> float:
         period_s, count = self._period_s(), 0
@@ -186,3 +222,7 @@ class FrameTimes:
         (first, first_s), (last, last_s) = self._arrivals[0], self._arrivals[-1]
         measured_s = (last_s - first_s) / (last - first)
         return min(max(measured_s, 0.8 * self._nominal_s), 1.25 * self._nominal_s)
+
+
+def _median(values: list[float]) -> float:
+    return sorted(values)[len(values) // 2]

@@ -124,6 +124,7 @@ def _sample(name: str, kind: DeviceKind, stamped: Stamped[Any], clock: Clock, to
         "age_s": jsonable(age_s),
         "quality": str(stamped.quality),
         "cause": str(stamped.cause),
+        "detail": stamped.detail,
         "took_s": took_s,
     }
 

@@ -152,6 +152,7 @@ class ReadingView(BaseModel):
     sequence: int
     quality: str
     cause: str
+    detail: str = ""
 
 
 class FaultRequest(Strict):

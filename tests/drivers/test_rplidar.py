@@ -14,15 +14,17 @@ from drivers.emulators import rplidar as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
 from drivers.rplidar.express import CAPSULE_BYTES, REQUEST, CapsuleParser, decode_capsule, is_capsule, is_first
-from drivers.rplidar.scanner import NodeParser, Rplidar, RplidarOptions, decode, descriptor, sectors, turns_back
+from drivers.rplidar.nodes import NodeParser, decode
+from drivers.rplidar.scanner import Rplidar, RplidarOptions, descriptor, sectors
+from drivers.rplidar.turns import Measurements, TurnCollector, missing_rad
 from drivers.transport.checks import xor_byte
 from drivers.transport.link import NoAnswer, now_s
 from hal.conformance import RangeScannerContract, Rig
 from hal.devices import RangeImage
 from hal.errors import DeviceUnavailable
-from hal.readings import Quality
+from hal.readings import Cause, Quality
 from hal.registry import Context, connect
-from tests.drivers.rigs import ScriptLink, count_good, soon, wired, wired_rig
+from tests.drivers.rigs import ScriptLink, count_good, soon, until, wired, wired_rig
 
 DRIVER = "serial:rplidar"
 FAST = {"scan_rate_hz": 40.0}
@@ -50,7 +52,7 @@ def test_measurements_do_not_depend_on_chunks_and_survive_noise(seed: int, cuts:
     places = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
     parser = NodeParser()
     runs = [run for a, b in pairwise(places) for run in parser.feed(data[a:b])]
-    _, angle_rad, got_m = decode(np.concatenate([run for run in runs if run is not None])[-340:])
+    angle_rad, got_m = decode(np.concatenate([run for run in runs if run is not None])[-340:])
     true_m = np.round(np.tile(range_m, 2) * 4000) / 4000
     np.testing.assert_allclose(got_m, true_m[-348:-8])
     np.testing.assert_allclose(angle_rad, np.tile(TURN_RAD, 2)[-348:-8], atol=math.radians(1 / 128) + 1e-9)
@@ -73,18 +75,64 @@ def test_sectors_keep_the_nearest_and_leave_empty_ones_empty() -> None:
 def is_a_true_turn(image: RangeImage, reads: int) -> bool:
     c = ScriptedScanner().capabilities()
     signed = (TURN_RAD + math.pi) % math.tau - math.pi
+    seen = np.isfinite(image.depth_m[0])
+    assert seen.sum() >= 170, "more than half of a turn is missing"
     return any(
-        np.allclose(image.depth_m[0], line_m(RangeImage(depth_m=scripted_scan(i)), c, signed), atol=2e-4)
+        np.allclose(image.depth_m[0][seen], line_m(RangeImage(depth_m=scripted_scan(i)), c, signed)[seen], atol=2e-4)
         for i in range(max(1, reads - 60), reads + 1)
     )
 
 
 @pytest.mark.parametrize("fault", [None, "drop", "dup", "split", "delay", "silent", "garbage", "echo", "disconnect"])
-def test_every_turn_is_whole_and_exact_whatever_the_wire_does(fault: str | None) -> None:
+def test_every_measurement_is_exact_whatever_the_wire_does(fault: str | None) -> None:
     backing = ScriptedScanner()
     options = {**FAST, "fault": fault, "every": 4, "seed": 6, "delay_s": 0.1, "silent_s": 0.1, "away_s": 0.02}
     with wired(emulator.start(backing, options), DRIVER, {"scan_rate_hz": 20.0}) as device:
         assert count_good(device, lambda image: is_a_true_turn(image, backing.reads)) >= 5
+
+
+@pytest.mark.parametrize(
+    ("mode", "bursts", "fault", "every", "lost_deg"),
+    [
+        ("standard", 36, "crc", 3, (110, 130)),  # in standard mode such a burst is lost as a whole
+        ("standard", 36, "drop", 18, (9, 80)),
+        ("standard", 36, "garbage", 18, (10, 60)),
+        ("standard", 36, "dup", 18, (0, 0)),
+        ("express", 12, "crc", 3, (110, 130)),
+        ("express", 12, "drop", 12, (25, 65)),
+        ("express", 12, "dup", 12, (0, 0)),
+    ],
+)
+def test_a_turn_with_gaps_is_given_with_what_is_missing(
+    mode: str, bursts: int, fault: str, every: int, lost_deg: tuple[float, float]
+) -> None:
+    fast = {"scan_rate_hz": 10.0, "nodes": 384 if mode == "express" else 360, "bursts": bursts, "seed": 3}
+    backing = ScriptedScanner()
+    with wired(
+        emulator.start(backing, {**fast, "fault": fault, "every": every}), DRIVER, {"mode": mode, "scan_rate_hz": 10.0}
+    ) as device:
+        until(lambda: device.mailbox.published >= 8)
+        samples, _ = device.mailbox.since(2)
+    for sample in samples:
+        empty = np.isnan(sample.value.depth_m).sum()
+        assert lost_deg[0] - 5 <= empty <= lost_deg[1] + 5
+        assert (sample.quality is Quality.VALID) == (not sample.detail) == (empty <= 5)
+        if sample.detail:
+            assert (sample.quality, sample.cause) == (Quality.DEGRADED, Cause.COMM)
+            told = int(sample.detail.split()[0])
+            assert abs(told - empty) <= 5 and lost_deg[0] <= told <= lost_deg[1]
+        if mode == "standard":
+            assert is_a_true_turn(sample.value, backing.reads)
+
+
+def test_less_than_half_of_a_turn_is_not_given() -> None:
+    far_side = emulator.start(ScriptedScanner(), {"scan_rate_hz": 40.0, "bursts": 4, "fault": "crc", "every": 1})
+    try:
+        with pytest.raises(DeviceUnavailable, match="gives no valid data"):
+            device = Rplidar(Context(name="scanner"), RplidarOptions(**far_side.address))
+            device.join(0.3)
+    finally:
+        far_side.close()
 
 
 def test_an_ill_scanner_is_reset_once() -> None:
@@ -147,13 +195,51 @@ def test_an_incurable_scanner_is_told() -> None:
         far_side.close()
 
 
-def test_a_turn_with_a_stray_angle_in_it_turns_back_and_one_with_lost_measurements_does_not() -> None:
-    angle_rad = np.radians(np.arange(0.0, 360.0, 1.0))
-    assert not turns_back(angle_rad)
-    assert not turns_back(np.delete(angle_rad, slice(40, 60)))
-    assert not turns_back((angle_rad + 3.0) % (2 * np.pi))
-    for stray_deg in (200.0, 350.0, 90.0):
-        assert turns_back(np.insert(angle_rad, 100, np.radians(stray_deg)))
+def measured(angle_rad: Any, distance_m: Any = None) -> Measurements:
+    angle_rad = np.asarray(angle_rad) % math.tau
+    distance_m = np.ones(len(angle_rad)) if distance_m is None else distance_m
+    return Measurements(
+        head_rad=angle_rad, angle_rad=angle_rad, distance_m=distance_m, arrived_s=np.zeros(len(angle_rad))
+    )
+
+
+def turns_of(*pieces: Measurements) -> list[Measurements]:
+    """Return the turns that one whole turn, these pieces and the begin of another turn give."""
+    collector = TurnCollector()
+    whole = measured(TURN_RAD)
+    return [turn for piece in (whole, *pieces, whole, whole) for turn, _ in collector.add(piece)]
+
+
+def test_a_turn_with_a_stray_angle_in_it_is_discarded_and_one_with_a_gap_is_not() -> None:
+    assert [len(turn) for turn in turns_of(measured(TURN_RAD))] == [360, 360]
+    assert [len(turn) for turn in turns_of(measured(np.delete(TURN_RAD, slice(40, 60))))] == [340, 360]
+    assert [len(turn) for turn in turns_of(measured(TURN_RAD + math.radians(0.4)))] == [360, 360]
+    for place in (5, 100, 300):
+        for stray_deg in (10.0, 90.0, 200.0, 350.0):
+            angle_rad, distance_m = np.insert(TURN_RAD, place, np.radians(stray_deg)), np.ones(361)
+            distance_m[place] = 9.0
+            strayed = turns_of(measured(angle_rad, distance_m))
+            assert len(strayed[-1]) == 360 and all(np.all(turn.distance_m == 1.0) for turn in strayed)
+
+
+def test_a_piece_that_came_twice_is_taken_once() -> None:
+    distance_m = np.linspace(1.0, 2.0, 360)
+    whole = measured(TURN_RAD, distance_m)
+    for cut in (130, 150, 155):
+        [turn, _] = turns_of(whole.at(slice(0, 150)), whole.at(slice(120, cut)), whole.at(slice(cut, None)))
+        np.testing.assert_array_equal(turn.distance_m, distance_m)
+
+
+@pytest.mark.parametrize("count", [36, 360, 3600])
+@pytest.mark.parametrize("lost_deg", [0, 12, 30, 120, 150])
+@pytest.mark.parametrize("first_deg", [0, 100, 300])
+def test_the_missing_angle_is_told(count: int, lost_deg: int, first_deg: int) -> None:
+    """Gaps in the middle, at the start and across the start of a turn; steps vary by the motor's jitter."""
+    rng = np.random.default_rng(count)
+    angle_rad = np.sort((np.arange(count) + rng.uniform(-0.2, 0.2, count)) * math.tau / count)
+    place_deg = (np.arange(count) * 360.0 / count - first_deg) % 360.0
+    got_deg = math.degrees(missing_rad(angle_rad[place_deg >= lost_deg] % math.tau))
+    assert got_deg == pytest.approx(lost_deg, abs=max(2.0, 360.0 / count) + 0.02 * (360 - lost_deg))
 
 
 class TestExpress(RangeScannerContract):
@@ -178,7 +264,8 @@ def test_a_capsule_by_hand() -> None:
     check = xor_byte(bytes(body))
     capsule = bytes([0xA0 | check & 15, 0x50 | check >> 4]) + bytes(body)
     assert is_capsule(capsule) and not is_first(capsule)
-    angle_rad, distance_m = decode_capsule(capsule, np.radians(42.0))
+    head_rad, angle_rad, distance_m = decode_capsule(capsule, np.radians(42.0))
+    assert np.degrees(head_rad) == pytest.approx(np.arange(10, 42))
     assert np.degrees(angle_rad[:2]) == pytest.approx([10.0 - 18 / 8, 11.0 - 37 / 8])
     assert distance_m[:2] == pytest.approx([1.5, 2.5])
     assert np.all(np.isnan(distance_m[2:]))
@@ -204,7 +291,7 @@ def test_express_measurements_do_not_depend_on_the_chunks(sizes: list[int], nois
 def test_a_lost_capsule_does_not_stretch_its_neighbour() -> None:
     turn = emulator.encode_capsules(np.linspace(1.0, 2.0, 384), is_first=False)
     parts = CapsuleParser().feed(turn[: 5 * CAPSULE_BYTES] + turn[6 * CAPSULE_BYTES :])
-    assert [part is None for part in parts] == [False] * 3 + [True] * 2 + [False] * 4
+    assert [part is None for part in parts] == [False] * 4 + [True] + [False] * 5
 
 
 @pytest.mark.parametrize("fault", ["crc", "drop", "dup", "split", "garbage", "delay"])

@@ -10,6 +10,7 @@ from drivers.transport.framing import Framer
 from drivers.transport.link import Link, drain
 from drivers.transport.options import SerialOptions, read_options, serial_opener
 from drivers.transport.stream import StreamDevice
+from drivers.transport.timebase import FrameTimes
 from hal.clock import Deadline
 from hal.devices import DeviceKind, ProximityCapabilities
 from hal.readings import Stamped
@@ -38,6 +39,7 @@ class Rangefinder(StreamDevice[float]):
         opener, link_name = serial_opener(options, context.name)
         super().__init__(context, open_link=opener, link_name=link_name, max_age_s=3.0 / RATE_HZ)
         self._framer = framer()
+        self._times = FrameTimes(period_s=1.0 / RATE_HZ, frame_bytes=FRAME.size)
         self._counter: int | None = None
 
     def capabilities(self) -> ProximityCapabilities:
@@ -52,18 +54,19 @@ class Rangefinder(StreamDevice[float]):
         """Bring the device from any state to streaming: stop, identify, configure, start. This one needs none of it."""
         drain(link)
         self._framer.reset()
+        self._times.reset()
         self._counter = None
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Publish each complete frame; its counter shows which frames were lost or repeated."""
-        for frame in self._framer.feed(chunk):
+        for frame, valid_s in self._times.stamped(self._framer.feed(chunk), arrived_s=arrived_s, byte_s=self.byte_s):
             _, counter, *numbers, _ = FRAME.unpack(frame)
             gap = 1 if self._counter is None else (counter - self._counter) % 256
             if gap == 0:
                 continue
             self._counter = counter
             value = numbers[0] / 1000.0
-            self.publish(value, valid_s=arrived_s - len(frame) * self.byte_s, missed=gap - 1)
+            self.publish(value, valid_s=valid_s, missed=gap - 1)
 
 
 @takes(RangefinderOptions)

@@ -18,6 +18,7 @@ from multiprocessing.connection import Client, Connection, Listener
 from pathlib import Path
 from typing import Any
 
+from hal.caller import caller, calling_as
 from hal.channel import Channel
 from hal.clock import Clock, Deadline, WallClock
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
@@ -78,8 +79,10 @@ class HostServer:
             target = self._objects.get(channel.receive())
             channel.send(None if target is None else _describe(target))
             while target is not None and not self._is_closed.is_set():
-                method, args, kwargs = channel.receive()
-                _send(channel, _answer(target, method, args, kwargs))
+                method, args, kwargs, name = channel.receive()
+                with calling_as(name):
+                    answer = _answer(target, method, args, kwargs)
+                _send(channel, answer)
         except (EOFError, OSError):
             pass  # the client has disconnected, so its calls end
         finally:
@@ -193,7 +196,7 @@ class Proxy:
         channel = self._channel
         assert channel is not None  # noqa: S101 - narrowing: `_open` made it or raised
         try:
-            channel.send((method, args, kwargs))
+            channel.send((method, args, kwargs, caller()))
             if deadline is not None and not channel.poll(deadline.remaining_s() + ANSWER_MARGIN_S):
                 raise self._late(method, "its process may be busy or hung")
             outcome, value = channel.receive()

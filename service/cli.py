@@ -53,6 +53,7 @@ def _app() -> Callable[[], None]:
     from service.commands.learn import learn
     from service.commands.range import batch, range_image
     from service.commands.read import read
+    from service.commands.record import record, replay
     from service.commands.serve import serve
     from service.commands.teach import teach
     from service.commands.version import root
@@ -68,6 +69,8 @@ def _app() -> Callable[[], None]:
     app.command()(init)
     app.command()(serve)
     app.command()(demo)
+    app.command()(record)
+    app.command()(replay)
     app.command()(doctor)
     app.add_typer(devices.app, name="devices")
     app.command()(drivers)

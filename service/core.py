@@ -7,13 +7,14 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
+from hal.caller import calling_as
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
 from service.commissioning.preflight import check_wires
@@ -29,6 +30,10 @@ from service.tasks.model import Artefact, Task, TaskState
 from service.tasks.store import TaskContext, TaskStore
 from service.world_model import WorldModel
 
+if TYPE_CHECKING:
+    from service.processes.cell import CellRuntime
+    from service.recording.session import RecordingSession
+
 RESTORED_TASKS = 100
 LOOK_S = 0.05
 log = logging.getLogger(__name__)
@@ -41,7 +46,8 @@ class Service:
         cell: the cell to run.
         operations: the operations by verb.
         runs_dir: folder for the reports of missions; tasks and journal are kept in `runs_dir/.service`.
-        stop_listener, origins, inline, partial: see `Supervisor`.
+        stop_listener, origins, inline, partial, replay: see `Supervisor`.
+        record: file to record everything in, from before the start of the cell to the end of the service.
     """
 
     def __init__(
@@ -54,6 +60,8 @@ class Service:
         origins: tuple[str, ...] = (),
         inline: bool = False,
         partial: bool = False,
+        record: Path | None = None,
+        replay: Callable[[], CellRuntime] | None = None,
     ) -> None:
         self.cell = cell
         self.operations = operations
@@ -62,6 +70,7 @@ class Service:
         self.calibrations = Calibrations.of_runs(runs_dir, cell)
         self.started_s = time.monotonic()
         state_dir = runs_dir / ".service"
+        self._recording = None if record is None else self._record(record, inline)
         self.journal = Journal(state_dir / "journal.sqlite")
         self.supervisor = Supervisor(
             cell,
@@ -71,8 +80,13 @@ class Service:
             runs_dir=runs_dir,
             partial=partial,
             report=self.note,
+            record=None if self._recording is None else self._recording.endpoint,
+            replay=replay,
         )
-        self.tasks = TaskStore(state_dir / "tasks", recorder=self.journal, stop_motion=self._stop_motion)
+        recorder = self.journal if self._recording is None else self._recording.recorder(self.journal)
+        self.tasks = TaskStore(state_dir / "tasks", recorder=recorder, stop_motion=self._stop_motion)
+        if self._recording is not None:
+            self.tasks.subscribe(self._recording.on_task)
         self.lease = LeaseDesk(
             ttl_s=cell.file.safety.lease_ttl_s,
             on_loss=self.tasks.cancel_moving,
@@ -122,20 +136,15 @@ class Service:
                 task.check_cancelled()
                 self._check_not_stopped_since(latch.count)
 
-            return operation.run(
-                OperationContext(
-                    connection=GatedConnection(
-                        self.supervisor.connection,
-                        check_may_move,
-                        cell=self.calibrations.applied(),
-                        stop=self.supervisor.stop,
-                    ),
-                    task=task,
-                    runs_dir=self.runs_dir,
-                    world=self.world,
-                ),
-                request,
+            connection = GatedConnection(
+                self.supervisor.connection,
+                check_may_move,
+                cell=self.calibrations.applied(),
+                stop=self.supervisor.stop,
             )
+            context = OperationContext(connection=connection, task=task, runs_dir=self.runs_dir, world=self.world)
+            with calling_as(f"{verb} {task.id}"):
+                return operation.run(context, request)
 
         plain = request.model_dump(mode="json")
         task = self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key)
@@ -194,6 +203,8 @@ class Service:
         self.supervisor.close()
         self.note("service-end", {})
         self.journal.close()
+        if self._recording is not None:
+            self._recording.close()
         self._folder_lock.close()
 
     def stop_quietly(self, source: str) -> None:
@@ -229,10 +240,17 @@ class Service:
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
         """Write an entry to the journal without waiting for the disk."""
+        if self._recording is not None:
+            self._recording.note(kind, data)
         try:
             self.journal.note(kind, data)
         except CellError as error:
             log.error("not recorded: %s %s: %s", kind, data, error)
+
+    def _record(self, path: Path, inline: bool) -> RecordingSession:
+        from service.recording.session import RecordingSession
+
+        return RecordingSession.start(path, self.cell, calibrations=self.calibrations, inline=inline)
 
     def _restore_tasks(self) -> None:
         """Restore the tasks of earlier runs from the journal."""

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -24,6 +24,7 @@ from service.processes.stop_host import bound_socket
 
 if TYPE_CHECKING:
     from service.http.server import HttpServer
+    from service.processes.cell import CellRuntime
 
 log = logging.getLogger(__name__)
 SWITCH_S = 0.001  # Python's default is 5 ms; a computing thread yields to the event loop sooner
@@ -37,6 +38,8 @@ class Options:
         stop_port: None for the port after `port`, or for any free port.
         partial: whether to go on without devices that do not connect.
         warm: whether to load the compiled kernels at the start.
+        record: file to record everything in.
+        replay: starts a recorded cell in place of the devices; needs `inline`.
     """
 
     host: str = "127.0.0.1"
@@ -46,6 +49,8 @@ class Options:
     inline: bool = False
     partial: bool = False
     warm: bool = True
+    record: Path | None = None
+    replay: Callable[[], CellRuntime] | None = None
 
 
 class Panelwright:
@@ -89,6 +94,8 @@ class Panelwright:
             origins=tuple(sorted(origins)),
             inline=options.inline,
             partial=options.partial,
+            record=options.record,
+            replay=options.replay,
         )
 
     @property

@@ -36,6 +36,9 @@ def serve(
     runs: Annotated[Path, typer.Option(help="Folder for reports, journal and artefacts.")] = Path("runs"),
     seed: SeedOption = None,
     warm: Annotated[bool, typer.Option(help="Load the compiled kernels right after the start.")] = True,
+    record: Annotated[
+        Path | None, typer.Option(help="Record everything that the devices are asked and answer in this file (MCAP).")
+    ] = None,
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Start the cell and serve it until Ctrl-C, even if some devices are missing."""
@@ -44,7 +47,16 @@ def serve(
     check_host(host)
     loaded = read_cell(cell, seed)
     compile_first()
-    options = Options(host=host, port=port, stop_port=stop_port, runs_dir=runs, inline=inline, partial=True, warm=warm)
+    options = Options(
+        host=host,
+        port=port,
+        stop_port=stop_port,
+        runs_dir=runs,
+        inline=inline,
+        partial=True,
+        warm=warm,
+        record=record,
+    )
     panelwright = Panelwright(loaded, options)
     threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()
     console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")

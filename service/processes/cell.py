@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hal.clock import Clock, PacedClock, SimClock, WallClock
 from hal.config import Cell, DeviceSection, load_cell
@@ -42,6 +42,10 @@ from service.processes.device_slots import (
 )
 from service.processes.latch import Beat, Latch
 from service.processes.motion import MotionPort, start_controller
+from service.recording.endpoint import Endpoint
+
+if TYPE_CHECKING:
+    from service.recording.tap import Tap  # only a recorded cell needs the libraries behind it
 
 BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
@@ -70,6 +74,7 @@ class CellRuntime:
         runs_dir: Path | None = None,
         partial: bool = False,
         report: Report = lambda _kind, _data: None,
+        record: Endpoint | None = None,
     ) -> CellRuntime:
         """Start the emulators, connect all devices in parallel, then start the control thread.
 
@@ -80,6 +85,7 @@ class CellRuntime:
                 records of the cell file.
             partial: whether to continue without devices that do not connect; an invalid cell file is refused in any case.
             report: called when an isolated driver stops or restarts, and for each device that is `MISSING`.
+            record: the recorder to which every call of the devices, the mover and the clock is told.
 
         Raises:
             CellError: lists everything that could not be connected; what had been started is closed again.
@@ -87,8 +93,7 @@ class CellRuntime:
         emulated = {name: cell.file.devices[name] for name in cell.file.emulators}
         cell.file.devices.update(swapped or {})
         _import_drivers(cell)
-        clock = clock_for(cell)
-        shared = Shared()
+        clock, shared = clock_for(cell), Shared()
         closers: list[Callable[[], None]] = [shared.close]
         try:
             far_sides = start_emulators(cell, clock, shared, closers)
@@ -106,15 +111,16 @@ class CellRuntime:
 
             sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
             slots = _connect_all(cell, sections, connect, closers, report=report if partial else None)
-            objects: dict[str, Any] = {**slots, PREFIX + CLOCK: clock}
-            objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
-            motion: MotionPort | None = None
-            if cell.names_of(DeviceKind.ARM):
-                measured = cell if runs_dir is None else Calibrations.of_runs(runs_dir, cell).applied()
-                motion = start_controller(measured, slots, clock=clock, is_latched=is_latched)
+            behind = {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
+            objects: dict[str, Any] = {**slots, **behind, PREFIX + CLOCK: clock}
+            tap = _tap(record, clock, report, closers)
+            used = tap.for_control(slots) if tap else slots
+            motion = _motion(cell, used, clock=clock, runs_dir=runs_dir, is_latched=is_latched)
+            if motion is not None:
                 objects[PREFIX + MOVER] = motion
                 closers.append(motion.close)
-            objects[PREFIX + SWAPPER] = Swapper(cell, connect=connect, complete=complete, slots=slots, motion=motion)
+            swapper = Swapper(cell, connect=connect, complete=complete, slots=slots, motion=motion)
+            objects = {**(tap.begin(objects) if tap else objects), PREFIX + SWAPPER: swapper}
         except BaseException:
             _close_all(closers)
             raise
@@ -124,6 +130,27 @@ class CellRuntime:
         """Stop the arm, then close devices, emulators and world even if some of them fail. Idempotent."""
         closers, self._closers = self._closers, []
         _close_all(closers)
+
+
+def _motion(
+    cell: Cell, slots: Mapping[str, Any], *, clock: Clock, runs_dir: Path | None, is_latched: Callable[[], bool]
+) -> MotionPort | None:
+    """Start the control thread with the calibrations measured here; returns None for a cell without an arm."""
+    if not cell.names_of(DeviceKind.ARM):
+        return None
+    measured = cell if runs_dir is None else Calibrations.of_runs(runs_dir, cell).applied()
+    return start_controller(measured, slots, clock=clock, is_latched=is_latched)
+
+
+def _tap(record: Endpoint | None, clock: Clock, report: Report, closers: list[Callable[[], None]]) -> Tap | None:
+    """Return the tap of a recorded cell; its sender is closed before the devices, but after the control thread."""
+    if record is None:
+        return None
+    from service.recording.tap import Tap
+
+    sender = record.sender(report)
+    closers.append(sender.close)
+    return Tap(sender=sender, clock=clock)
 
 
 def _import_drivers(cell: Cell) -> None:
@@ -240,6 +267,7 @@ class CellOrder:
     runs_dir: str | None
     partial: bool
     swapped: dict[str, dict[str, Any]]
+    record: tuple[str, str] | None = None
 
     def to_line(self) -> str:
         """Return the order as one line of JSON."""
@@ -307,6 +335,7 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
         runs_dir=runs_dir,
         partial=order.partial,
         report=lambda kind, data: lifeline.write_line(note_to_line(kind, data)),
+        record=None if order.record is None else Endpoint(*order.record),
     )
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     freeze_loaded()

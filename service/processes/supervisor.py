@@ -23,6 +23,7 @@ from service.processes.child import Child
 from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
 from service.processes.latch import Beat, Latch, LatchState
 from service.processes.stop_host import InlineStop, ProcessStop
+from service.recording.endpoint import Endpoint
 
 START_TIMEOUT_S = 400.0  # the first start compiles the control kernels, which takes minutes on a busy machine
 MAX_RESTARTS = 3
@@ -91,6 +92,8 @@ class Supervisor:
         runs_dir: folder of the calibration records found here; None to use only those of the cell file.
         partial: whether to go on without devices that do not connect; see `missing`.
         report: called for each start, unexpected end, stop and reset.
+        record: the recorder to which the cell tells every call; None to record nothing.
+        replay: starts the recorded cell in place of the devices of `cell`; needs `inline`.
     """
 
     def __init__(
@@ -103,7 +106,11 @@ class Supervisor:
         runs_dir: Path | None = None,
         partial: bool = False,
         report: Report = lambda _kind, _data: None,
+        record: Endpoint | None = None,
+        replay: Callable[[], CellRuntime] | None = None,
     ) -> None:
+        self._record = record
+        self._replay = replay
         self.cell = cell
         self.inline = inline
         self._runs_dir = runs_dir
@@ -248,11 +255,19 @@ class Supervisor:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _start_inline(self) -> None:
-        runtime = CellRuntime.start(
-            self.cell, is_latched=self.latch.is_set, runs_dir=self._runs_dir, partial=self._partial, report=self._note
-        )
+        runtime = self._replay() if self._replay is not None else self._start_runtime()
         self._local = LocalConnection(self.cell, runtime.objects, close=runtime.close)
         self._is_ready.set()
+
+    def _start_runtime(self) -> CellRuntime:
+        return CellRuntime.start(
+            self.cell,
+            is_latched=self.latch.is_set,
+            runs_dir=self._runs_dir,
+            partial=self._partial,
+            report=self._note,
+            record=self._record,
+        )
 
     def _start_child(self) -> None:
         from hal.host import connect
@@ -314,6 +329,7 @@ class Supervisor:
             runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
             partial=self._partial,
             swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
+            record=None if self._record is None else (self._record.address, self._record.key),
         )
 
     def _begin_child(self, on_line: Callable[[str], None], on_exit: Callable[[int], None]) -> Child:

@@ -1,10 +1,11 @@
-"""Diagnosis of links: ports, permissions, owners, latency timers, working baud rate, measured latency.
+"""Diagnosis of links: ports, adapters, permissions, owners, latency timers, working baud rate, measured latency.
 
 `panelwright doctor` finds this by the entry point `panelwright.doctor`.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import statistics
 import time
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from drivers.transport.can_adapters import find_adapters
 from drivers.transport.device import WireDevice
 from drivers.transport.serial_link import SYSFS, latency_timer_ms, port_owner, serial_ports
 from hal.clock import Deadline, WallClock
@@ -52,9 +54,10 @@ class WireFinding:
 
 
 def examine(cell: Cell) -> Iterator[WireFinding]:
-    """Examine every serial port of this machine, then every device of the cell that has its own link."""
+    """Examine every serial port and CAN adapter of this machine, then every device of the cell that has its own link."""
     for path in serial_ports():
         yield examine_port(path)
+    yield from can_adapters(uses_can=any(one.driver.startswith("can:") for one in cell.file.devices.values()))
     for name, section in cell.file.devices.items():
         wire = serial_path(section.options)
         if wire is not None and name not in cell.file.emulators:
@@ -64,7 +67,26 @@ def examine(cell: Cell) -> Iterator[WireFinding]:
 def serial_path(options: Mapping[str, Any]) -> str | None:
     """Return the path of the serial port or slcan adapter named by the options, if any."""
     found = options.get("port", options.get("channel"))
-    return found if isinstance(found, str) and "/" in found else None
+    return found if isinstance(found, str) and "/" in found and "://" not in found else None
+
+
+def can_adapters(
+    *, uses_can: bool, search: Callable[[], list[dict[str, Any]]] = find_adapters
+) -> Iterator[WireFinding]:
+    """List the CAN adapters of this machine, each with the options that select it.
+
+    Args:
+        uses_can: whether the cell has CAN devices, so that it is worth saying that there is no adapter.
+        search: finds the adapters.
+    """
+    found = search()
+    for adapter in found:
+        subject = f"CAN {adapter.get('interface')} {adapter.get('channel', '')}".rstrip()
+        options = ", ".join(f"{key} = {json.dumps(value)}" for key, value in adapter.items())
+        yield WireFinding(subject, True, f"found: {options}")
+    if uses_can and not found:
+        what = "python-can finds none; an slcan adapter is a serial port"
+        yield WireFinding("CAN adapters", True, what, "install the maker's driver, or set a SocketCAN interface up")
 
 
 def examine_port(path: str, *, sysfs: Path = SYSFS) -> WireFinding:

@@ -11,8 +11,9 @@ import pytest
 from drivers.emulators import lms200, tfmini
 from drivers.emulators.ports import PtyPort
 from drivers.emulators.scripted import ScriptedProximity, ScriptedScanner
+from drivers.transport.can_adapters import find_adapters, plain, read_findings
 from drivers.transport.serial_link import latency_timer_ms, port_owner, shorten_latency_timer
-from drivers.wire_doctor import WireFinding, examine_device, examine_port, measured, serial_path
+from drivers.wire_doctor import WireFinding, can_adapters, examine_device, examine_port, measured, serial_path
 from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.registry import Context, connect
 
@@ -47,10 +48,30 @@ def test_a_free_port_is_good(tmp_path: Path) -> None:
         ({"channel": "/dev/c"}, "/dev/c"),
         ({"port": 502}, None),
         ({"channel": "can0"}, None),
+        ({"channel": "tcp://host:4000"}, None),
     ],
 )
 def test_devices_with_a_serial_wire_are_told_by_their_options(options: dict[str, Any], path: str | None) -> None:
     assert serial_path(options) == path
+
+
+def test_can_adapters_are_listed_with_the_options_that_select_them() -> None:
+    told = b'{"interface": "pcan", "channel": "PCAN_USBBUS1", "fd": true}\n{"interface": "soc'
+    (found,) = can_adapters(uses_can=True, search=lambda: read_findings(told))
+    assert (found.subject, found.is_good) == ("CAN pcan PCAN_USBBUS1", True)
+    assert found.what == 'found: interface = "pcan", channel = "PCAN_USBBUS1", fd = true'
+    assert plain({"channel": 0, "config": object()}) == {"channel": 0}
+
+
+def test_that_there_is_no_can_adapter_is_said_where_the_cell_needs_one() -> None:
+    assert [f.subject for f in can_adapters(uses_can=True, search=list)] == ["CAN adapters"]
+    assert list(can_adapters(uses_can=False, search=list)) == []
+
+
+def test_the_search_for_adapters_prints_nothing_and_ends(capfd: pytest.CaptureFixture[str]) -> None:
+    assert isinstance(find_adapters(), list)
+    assert find_adapters(within_s=0.001) == []
+    assert capfd.readouterr() == ("", "")
 
 
 class Answers:

@@ -150,6 +150,7 @@ def test_names_need_an_eds_that_can_be_read(given: dict[str, Any], told: str) ->
         options(**given)
 
 
+@pytest.mark.filterwarnings("ignore:The 'warn' method is deprecated")  # in canopen
 @pytest.mark.parametrize("text", ["", "[607A]\n", "not an EDS"])
 def test_a_file_that_is_no_eds_is_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "drive.eds"

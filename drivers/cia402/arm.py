@@ -9,20 +9,16 @@ from __future__ import annotations
 
 import struct
 import threading
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
 
-from drivers.cia402.objects import faults_of, parameters_of, read_eds
-from drivers.cia402.setup import PROBES, SDO_REQUEST, SDO_S, Parameter, SdoClient, SetUp, upload_request
-from drivers.cia402.states import DISABLE, FAULT_RESET, QUICK_STOP, DriveState, state_of, towards_enabled
-from drivers.cia402.sync import SyncCount
-from drivers.kinds.arms import KinematicsOptions, SetPointFilter, capabilities, require_stations
+from drivers.cia402.options import Cia402Options
+from drivers.cia402.setup import PROBES, SDO_REQUEST, SDO_S, SdoClient, SetUp, upload_request
+from drivers.cia402.states import Axis, DriveState, control_word
+from drivers.kinds.arms import SetPointFilter, capabilities
 from drivers.transport.can_frames import CanFrame, FrameReader, record
-from drivers.transport.canbus import CanOptions, can_opener
+from drivers.transport.canbus import can_opener
 from drivers.transport.device import wall_until
 from drivers.transport.link import Link, NoAnswer, Refused, drain, now_s
 from drivers.transport.options import read_options
@@ -43,91 +39,6 @@ CONNECT_S = 6.0  # seven objects for each of six drives
 MOVING_RAD_PER_S = 1e-3
 MOST_OWED = 4  # unanswered SYNCs of one drive before the host waits for it
 MOST_KNOWN = 64  # number of SYNCs whose time is kept
-
-
-class Cia402Options(CanOptions):
-    """Options of `can:cia402`; `host_node` is the id of our own heartbeat.
-
-    The thread that sends the SYNCs requests `realtime_priority`, 0 for none; it is no error if the system refuses.
-    """
-
-    nodes: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=126)], ...], Field(description="node of the drive of each joint")
-    ] = (1, 2, 3, 4, 5, 6)
-    host_node: Annotated[
-        int, Field(ge=1, le=127, description="node of this computer, whose heartbeat the drives monitor")
-    ] = 127
-    rate_hz: Annotated[float, Field(ge=10, le=500, description="rate of SYNC messages and set-points")] = 100.0
-    heartbeat_s: Annotated[
-        float, Field(ge=0.02, le=1, description="period of this computer's heartbeat; the drives stop when it is lost")
-    ] = 0.1
-    realtime_priority: Annotated[
-        int,
-        Field(ge=0, le=99, description="priority that the thread of the SYNC messages asks the system for; 0 for none"),
-    ] = 10
-    degrees_per_increment: Annotated[
-        float, Field(gt=0, description="angle of one increment of the drives' position")
-    ] = 0.001
-    eds: Annotated[
-        Path | None,
-        Field(description="electronic data sheet of the drives (EDS or DCF file), against which objects are checked"),
-    ] = None
-    parameters: Annotated[
-        dict[str, int | Annotated[float, Field(allow_inf_nan=False)]],
-        Field(
-            description="objects that are written to every drive before it starts, by number (`6065`, `60C2:1`) or, with "
-            "`eds`, by name (`Interpolation time period.Interpolation time period value`)"
-        ),
-    ] = {}
-    kinematics: Annotated[KinematicsOptions, Field(description="links, limits and speeds of the arm")]
-
-    def known_arm(self) -> ArmCapabilities:
-        """Return the kinematics and limits given by `kinematics`."""
-        return capabilities(self.kinematics, command_rate_hz=self.rate_hz, watchdog_s=self.heartbeat_s)
-
-    @model_validator(mode="after")
-    def _one_node_a_joint(self) -> Self:
-        require_stations("nodes", self.nodes, self.kinematics)
-        if self.host_node in self.nodes:
-            raise ValueError(f"host_node {self.host_node} is also in nodes: give it a number that no drive has")
-        return self
-
-    @model_validator(mode="after")
-    def _objects_fit(self) -> Self:
-        drive = None if self.eds is None else read_eds(self.eds)
-        unfit = [] if drive is None else [f"eds: {fault}" for fault in faults_of(drive, bitrate=self.bitrate)]
-        unfit += [f"parameters: {fault}" for fault in parameters_of(self.parameters, drive)[1]]
-        if unfit:
-            raise ValueError("; ".join(unfit))
-        return self
-
-    def written(self) -> list[Parameter]:
-        """Return the objects of `parameters`."""
-        return parameters_of(self.parameters, None if self.eds is None else read_eds(self.eds))[0]
-
-    @property
-    def stations(self) -> tuple[str, ...]:
-        """Return one node id per axis."""
-        return tuple(f"node {node}" for node in self.nodes)
-
-
-@dataclass(slots=True)
-class Axis:
-    """Known state of one drive; only the owner thread writes it."""
-
-    status: int | None = None
-    increments: int = 0
-    velocity: int = 0
-    emergency: int = 0
-    count: SyncCount = field(default_factory=SyncCount)
-
-    @property
-    def state(self) -> DriveState:
-        """Return the state that the status word encodes."""
-        return DriveState.NOT_READY if self.status is None else state_of(self.status)
-
-    def __str__(self) -> str:
-        return f"{self.state}" + (f", emergency {self.emergency:04X}h" if self.emergency else "")
 
 
 class Cia402(StreamDevice[JointState]):
@@ -252,7 +163,9 @@ class Cia402(StreamDevice[JointState]):
 
     def _cycle(self, link: Link) -> None:
         with self._commands:
-            words = {node: self._control_word(axis) for node, axis in self._axes.items()}
+            words = {
+                node: control_word(axis.state, self._is_wanted, self._is_reset) for node, axis in self._axes.items()
+            }
             targets = self._targets
             self._is_reset = self._is_reset and any(axis.state is DriveState.FAULT for axis in self._axes.values())
         frames = [CanFrame(RPDO1 + n, struct.pack("<Hi", words[n], targets[n])) for n in self._options.nodes]
@@ -276,13 +189,6 @@ class Cia402(StreamDevice[JointState]):
             return None
         axis.count.probed(now)
         return CanFrame(SDO_REQUEST + node, upload_request(*PROBES[axis.count.probes % len(PROBES)]))
-
-    def _control_word(self, axis: Axis) -> int:
-        if not self._is_wanted:
-            return QUICK_STOP
-        if axis.state is DriveState.FAULT:
-            return FAULT_RESET if self._is_reset else DISABLE
-        return towards_enabled(axis.state)
 
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Collect the states of one SYNC, and handle emergency messages and drive restarts."""

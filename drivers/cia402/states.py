@@ -1,8 +1,11 @@
-"""States of a CiA-402 drive: decoding of the status word, and the control word to the next state (CiA 402-2, 6.3)."""
+"""States of a CiA-402 drive: decoding of the status word, and the next control word (CiA 402-2, 6.3)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from enum import StrEnum
+
+from drivers.cia402.sync import SyncCount
 
 
 class DriveState(StrEnum):
@@ -43,6 +46,34 @@ def state_of(status_word: int) -> DriveState:
     return next((state for state, mask, value in _PATTERNS if status_word & mask == value), DriveState.NOT_READY)
 
 
-def towards_enabled(state: DriveState) -> int:
-    """Return the control word for the next step to `operation_enabled`; a fault needs a separately requested reset."""
+def control_word(state: DriveState, is_wanted: bool, is_reset: bool) -> int:
+    """Return the control word to send to a drive in this state.
+
+    Args:
+        is_wanted: whether the drive should be in `operation_enabled`; otherwise it is stopped quickly.
+        is_reset: whether a fault may be reset.
+    """
+    if not is_wanted:
+        return QUICK_STOP
+    if state is DriveState.FAULT:
+        return FAULT_RESET if is_reset else DISABLE
     return _TOWARDS_ENABLED.get(state, DISABLE)
+
+
+@dataclass(slots=True)
+class Axis:
+    """Known state of one drive; only the owner thread writes it."""
+
+    status: int | None = None
+    increments: int = 0
+    velocity: int = 0
+    emergency: int = 0
+    count: SyncCount = field(default_factory=SyncCount)
+
+    @property
+    def state(self) -> DriveState:
+        """Return the state that the status word encodes."""
+        return DriveState.NOT_READY if self.status is None else state_of(self.status)
+
+    def __str__(self) -> str:
+        return f"{self.state}" + (f", emergency {self.emergency:04X}h" if self.emergency else "")

@@ -10,7 +10,8 @@ import canopen
 import numpy as np
 import pytest
 
-from drivers.cia402.arm import Cia402, Cia402Options
+from drivers.cia402.arm import Cia402
+from drivers.cia402.options import Cia402Options
 from drivers.cia402.states import DriveState
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm

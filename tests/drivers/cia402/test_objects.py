@@ -11,7 +11,7 @@ import can
 import canopen
 import pytest
 
-from drivers.cia402.arm import Cia402Options
+from drivers.cia402.options import Cia402Options
 from drivers.cia402.setup import Parameter, SdoClient, SetUp
 from drivers.emulators import cia402 as emulator
 from drivers.emulators.scripted import ScriptedArm

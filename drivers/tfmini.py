@@ -25,6 +25,12 @@ from hal.registry import Context, takes
 from hal.strict import Strict
 
 FRAME_BYTES = 9
+RAW_COLDEST, RAW_HOTTEST = (
+    (-40 + 256) * 8,
+    (100 + 256) * 8,
+)  # degrees Celsius of the chip; the sensor works up to 60 outside
+RAW_JUMP = 2 * 8  # degrees: a chip that warms up changes by less than 1 degree in a second
+AGREEING = 3
 STRENGTH_SATURATED = 65_535
 GET_VERSION, SET_RATE, SET_UNIT = 0x01, 0x03, 0x05
 VERSION_ANSWER = b"\x5a\x07\x01"
@@ -89,9 +95,46 @@ def command(code: int, payload: bytes = b"") -> bytes:
     return head + bytes([sum_low_byte(head)])
 
 
-def data_framer() -> Framer:
-    """Return a framer for data frames; `59 59` also occurs inside frames, so the sum decides."""
-    return Framer(b"\x59\x59", FRAME_BYTES, lambda f: sum_low_byte(f[:-1]) == f[-1])
+class FrameCheck:
+    """Checks the sum of a frame, and that its temperature is the one of the frames before.
+
+    A frame that lost bytes reaches into the next one, and its 8-bit sum passes once in 256 times. What then stands in the
+    place of the temperature is a header, a sum or an echo strength. The first temperature must be one that a sensor can
+    have; one far from the last is believed when three frames in a row agree, so a sensor with another field there works.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the temperature, because the sensor may have been off."""
+        self._raw: int | None = None
+        self._other: int | None = None
+        self._agreeing = 0
+
+    def __call__(self, frame: bytes) -> bool:
+        """Return whether the frame is whole."""
+        if sum_low_byte(frame[:-1]) != frame[-1]:
+            return False
+        raw = frame[6] | frame[7] << 8
+        if not self._is_believed(raw):
+            return False
+        self._raw, self._other, self._agreeing = raw, None, 0
+        return True
+
+    def _is_believed(self, raw: int) -> bool:
+        if self._raw is None and RAW_COLDEST <= raw <= RAW_HOTTEST:
+            return True
+        if self._raw is not None and abs(raw - self._raw) <= RAW_JUMP:
+            return True
+        is_alike = self._other is not None and abs(raw - self._other) <= RAW_JUMP
+        self._other, self._agreeing = raw, self._agreeing + 1 if is_alike else 1
+        return self._agreeing >= AGREEING
+
+
+def data_framer(check: FrameCheck | None = None) -> Framer:
+    """Return a framer for data frames; `59 59` also occurs inside frames, so sum and temperature decide."""
+    return Framer(b"\x59\x59", FRAME_BYTES, check or FrameCheck())
 
 
 class Tfmini(StreamDevice[float]):
@@ -110,7 +153,8 @@ class Tfmini(StreamDevice[float]):
             silence_s=SILENCE_S,
         )
         self._options = options
-        self._framer = data_framer()
+        self._check = FrameCheck()
+        self._framer = data_framer(self._check)
         self._bad_before = 0
         self._times = FrameTimes(period_s=period_s, frame_bytes=FRAME_BYTES)
         self._unit_m = METRES[options.unit]
@@ -126,6 +170,7 @@ class Tfmini(StreamDevice[float]):
     def start(self, link: Link) -> None:
         """Set unit and rate; a sensor that confirms neither unit sends cm, its factory unit and the last one tried."""
         self._framer.reset()
+        self._check.reset()
         self._times.reset()
         asked = command(GET_VERSION)  # if this very command comes back, the line echoes
         seen = _exchange(link, asked, lambda data: VERSION_ANSWER in data)

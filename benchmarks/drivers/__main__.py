@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 
 from benchmarks.drivers.canbus import part_can
+from benchmarks.drivers.damaged import part_damaged
 from benchmarks.drivers.faults import part_faults
 from benchmarks.drivers.fuzz import part_fuzz
 from benchmarks.drivers.life import part_isolation, part_reconnect
@@ -31,6 +32,7 @@ PARTS: dict[str, Callable[[float], None]] = {
     "csp": part_csp,
     "kill": part_kill,
     "fuzz": part_fuzz,
+    "damaged": part_damaged,
     "faults": part_faults,
 }
 

@@ -1,14 +1,17 @@
 """Tests of the TFmini-Plus: conformance over a pty, faults of the link, and frames of the manual."""
 
 import math
+import struct
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from benchmarks.drivers.damaged import damages, passed
 from drivers.emulators import tfmini as emulator
 from drivers.emulators.scripted import ScriptedLights, ScriptedProximity
-from drivers.tfmini import command
+from drivers.tfmini import AGREEING, command, data_framer
+from drivers.transport.checks import sum_low_byte
 from hal.conformance import ProximityContract, Rig
 from hal.errors import ConfigError, DeviceUnavailable, Unsupported
 from hal.readings import Cause, Quality
@@ -46,6 +49,28 @@ def test_no_fault_of_the_wire_gives_a_wrong_distance(fault: str) -> None:
             assert backing.reads - 10 <= round(steps) <= backing.reads
             seen += 1
         assert seen >= 10
+
+
+@pytest.mark.parametrize("kind", [kind for kind in damages(0) if "flipped" not in kind])
+def test_no_frame_that_lost_bytes_passes_the_checks(kind: str) -> None:
+    """Of the 10 000 damaged frames 15 to 45 passed when the sum alone was checked."""
+    assert passed(damages(3)[kind], 30_000, seed=3) == 0
+
+
+def frame(distance: int, raw_temperature: int) -> bytes:
+    body = b"\x59\x59" + struct.pack("<HHH", distance, 2000, raw_temperature)
+    return body + bytes([sum_low_byte(body)])
+
+
+def test_the_temperature_may_drift_but_not_jump() -> None:
+    framer = data_framer()
+    assert len(framer.feed(b"".join(frame(100, 2300 + 10 * k) for k in range(30)))) == 30
+    assert framer.feed(frame(100, 2700) + frame(101, 2600)) == [frame(101, 2600)]
+
+
+def test_a_sensor_with_another_field_in_the_temperatures_place_is_read() -> None:
+    frames = [frame(100 + k, 7) for k in range(10)]
+    assert data_framer().feed(b"".join(frames)) == frames[AGREEING - 1 :]
 
 
 def test_weak_echo_is_invalid_and_not_a_number() -> None:

@@ -21,8 +21,9 @@ from hal.panel import PanelObject, Shown
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
 from service.operations.evaluate import shown_of
+from service.operations.find_panel import locate
 from service.operations.inspect import close_ups, look_past
-from service.operations.locate import go_to_overview, locate
+from service.operations.locate import go_to_overview
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection

@@ -25,12 +25,13 @@ FACE_PX_PER_M = 7000.0
 
 @dataclass(eq=False)
 class Canvas:
-    """Image of `width_m` x `height_m` with its centre at (0, 0), y up."""
+    """Image of `width_m` x `height_m` around `middle_m`, y up."""
 
     width_m: float
     height_m: float
     px_per_m: float
     ground: Colour
+    middle_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         self.zoom = self.px_per_m * SMOOTH
@@ -39,6 +40,7 @@ class Canvas:
 
     def px(self, x_m: float, y_m: float) -> tuple[float, float]:
         """Return the pixel coordinates of a point."""
+        x_m, y_m = x_m - self.middle_m[0], y_m - self.middle_m[1]
         return ((x_m + self.width_m / 2) * self.zoom, (self.height_m / 2 - y_m) * self.zoom)
 
     def line(self, a_m: tuple[float, float], b_m: tuple[float, float], width_m: float, ink: Colour = INK) -> None:

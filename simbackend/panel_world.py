@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.config import CableSection, Cell
-from hal.panel import Panel
+from hal.panel import Panel, Tag
 from hal.simulated import ObjectTruth
 from simbackend import textures
 from simbackend.bodies.body import body_of
@@ -29,6 +29,7 @@ LENS = 0  # the link of a border light that shines
 LIGHT_GLOW = (1.0, 0.97, 0.88)
 LIGHT_OFF = (0.42, 0.42, 0.40)
 DIM = 0.35
+TAG_LIFT_M = 1e-4  # least height of a print above the plate's own print, so that it is drawn in front of it
 LAMP_RADIANCE = 3.2  # a lit red lamp must be brighter than the plate in a grey image too
 LIGHT_RADIANCE = 5.0
 GLOW: dict[str, tuple[float, float, float]] = {
@@ -56,7 +57,9 @@ class PanelWorld:
         self._light_names = frozenset(light.name for light in cell.panel.lights)
         self._pictures: list[tuple[Quad, RigidTransform]] = []
         self._load_room(cell.file.workspace.floor_z_m)
-        self._load_plate()
+        self._load_plate(draws)
+        for tag in cell.panel.tags:
+            self._print_tag(tag, cell.panel.tolerances.tag_m * draws.stream(f"tag/{tag.name}").standard_normal(2))
         self._shines: dict[str, Shine] = {}
         self._light_places: list[tuple[float, float, float]] = []
         for light in cell.panel.lights:
@@ -93,17 +96,30 @@ class PanelWorld:
         look = engine.createVisualShape(engine.GEOM_BOX, halfExtents=[2, 2, 0.05], rgbaColor=[0.28, 0.29, 0.30, 1])
         self.bodies["_floor"] = engine.createMultiBody(0, floor, look, basePosition=[0, 0, floor_z_m - 0.05])
 
-    def _load_plate(self) -> None:
+    def _load_plate(self, draws: Draws) -> None:
+        """Load the plate, whose edges are where the file has them up to `tolerances.edge_m`."""
         engine, panel = self.engine, self.panel
-        half = [panel.width_m / 2, panel.height_m / 2, panel.thickness_m / 2]
+        edges_m = panel.tolerances.edge_m * draws.stream("plate/edges").standard_normal(4)  # right, top, left, bottom
+        size_m = (panel.width_m + edges_m[0] + edges_m[2], panel.height_m + edges_m[1] + edges_m[3])
+        middle_m = ((edges_m[0] - edges_m[2]) / 2, (edges_m[1] - edges_m[3]) / 2)
+        half = [size_m[0] / 2, size_m[1] / 2, panel.thickness_m / 2]
         solid = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half)
         look = engine.createVisualShape(
             engine.GEOM_BOX, halfExtents=[half[0], half[1], half[2] - 2e-4], rgbaColor=[0.5, 0.5, 0.5, 1]
         )
-        pose = self.base_from_panel * RigidTransform.from_translation([0, 0, -half[2]])
+        pose = self.base_from_panel * RigidTransform.from_translation([*middle_m, -half[2]])
         self.bodies["_plate"] = engine.createMultiBody(0, solid, look, *_pose(pose))
-        picture = Quad(pixels=textures.plate(panel), size_m=(panel.width_m, panel.height_m), centre_m=(0, 0, 0))
+        picture = Quad(pixels=textures.plate(panel, size_m, middle_m), size_m=size_m, centre_m=(*middle_m, 0))
         self._pictures.append((picture, self.base_from_panel))
+
+    def _print_tag(self, tag: Tag, jitter_m: Any) -> None:
+        """Put the print of a tag onto the plate; it has no thickness and nothing collides with it."""
+        x, y, z = tag.position_m
+        place = [x + jitter_m[0], y + jitter_m[1], max(z, TAG_LIFT_M)]
+        turn = Rotation.from_rotvec([0.0, 0.0, -tag.angle_rad])
+        pixels, side_m = textures.tag(tag)
+        picture = Quad(pixels=pixels, size_m=(side_m, side_m), centre_m=(0, 0, 0))
+        self._pictures.append((picture, self.base_from_panel * RigidTransform.from_components(place, turn)))
 
     def _load_cable(self, number: int, cable: CableSection) -> None:
         """Load a cable as stiff rods from point to point, with spheres at the joints."""

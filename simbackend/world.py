@@ -239,6 +239,7 @@ class World:
                 *self.pad_force_n,
                 *(self.q[DOF] + self.q[DOF + 1], self.gripper.is_moving, self.gripper.is_holding, 0.0),
                 *self.panel.lights_on,
+                *[0.0] * (LIGHTS - len(self.panel.lights_on)),
                 *self._proximity,
             ]
         )

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         Scale,
         State,
         States,
+        Tag,
         Vector2,
         Vector3,
     )
@@ -79,6 +80,7 @@ __all__ = [
     "State",
     "StateGoal",
     "States",
+    "Tag",
     "Taught",
     "Tilt",
     "Toggle",

@@ -1,4 +1,4 @@
-"""The panel file: plate, border lights and objects, each validated by the model of its kind."""
+"""The panel file: plate, border lights, printed tags and objects, each validated by the model of its kind."""
 
 from __future__ import annotations
 
@@ -11,15 +11,23 @@ from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, GetJsonSchemaHandler, TypeAdapter, ValidationError, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    GetJsonSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from hal.errors import InvalidRequest
 from hal.panel import kinds
 from hal.panel.angles import UNITLESS, Location, again, fault, in_radians
 from hal.panel.base import PanelObject
-from hal.panel.parts import Light, Name, NotNegative, Positive
-from hal.panel.plate import faults_of
+from hal.panel.parts import Light, Name, NotNegative, Positive, Tag
+from hal.panel.plate import Part, faults_of
 from hal.panel.turn import TURN_RAD, meant_otherwise
 from hal.strict import Strict, load_toml, reachable
 
@@ -64,32 +72,58 @@ def _of_its_kind(data: Any, info: ValidationInfo) -> PanelObject:
 
 
 AnyObject = Annotated[PanelObject, _OfItsKind]
-_PARTS: dict[str, TypeAdapter[Any]] = {"lights": TypeAdapter(Light), "objects": TypeAdapter(AnyObject)}
+_PARTS: dict[str, TypeAdapter[Any]] = {
+    "lights": TypeAdapter(Light),
+    "tags": TypeAdapter(Tag),
+    "objects": TypeAdapter(AnyObject),
+}
+
+
+def _four_or_none(lights: tuple[Light, ...]) -> tuple[Light, ...]:
+    if len(lights) not in (0, 4):
+        raise meant_otherwise(
+            f"a panel has four border lights or none, not {len(lights)}",
+            "give all four, or leave the lights out: then tags, the plate's outline or its objects show where it is",
+        )
+    return lights
+
+
+def _read_once(tags: tuple[Tag, ...]) -> tuple[Tag, ...]:
+    if len({tag.name for tag in tags}) != len(tags):
+        raise meant_otherwise("two tags have the same family and id", "print another id for one of them")
+    return tags
 
 
 class Tolerances(Strict):
-    """Deviations of a built panel from this file, one sigma each; only simulators draw random values from them."""
+    """Deviations of a built panel from this file, one sigma each.
+
+    Simulators draw the built panel from them, and the pose of the panel is as uncertain as they make it.
+    """
 
     position_m: NotNegative = 0.0002
     light_m: NotNegative = 0.0001
+    tag_m: Annotated[NotNegative, Field(description="place of a printed tag")] = 0.0003
+    edge_m: Annotated[NotNegative, Field(description="place of an edge of the plate")] = 0.0
     effort_ratio: NotNegative = 0.2
 
 
 class Panel(Strict):
-    """Panel: plate, border lights and objects."""
+    """Panel: plate, border lights, printed tags and objects."""
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
     name: Name
     width_m: Positive
     height_m: Positive
     thickness_m: Positive = 0.01
-    lights: Annotated[tuple[Light, ...], Field(min_length=4, max_length=4)]
+    lights: Annotated[tuple[Light, ...], AfterValidator(_four_or_none)] = ()
+    tags: Annotated[tuple[Tag, ...], AfterValidator(_read_once)] = ()
     objects: tuple[AnyObject, ...] = ()
     tolerances: Tolerances = Tolerances()
 
     @model_validator(mode="after")
     def _parts_have_their_own_names_and_places(self) -> Panel:
-        parts: dict[Location, Light | PanelObject] = {("lights", k): light for k, light in enumerate(self.lights)}
+        parts: dict[Location, Part] = {("lights", k): light for k, light in enumerate(self.lights)}
+        parts |= {("tags", k): tag for k, tag in enumerate(self.tags)}
         parts |= {("objects", k): panel_object for k, panel_object in enumerate(self.objects)}
         faults = faults_of(self.width_m, self.height_m, parts)
         if faults:
@@ -99,7 +133,7 @@ class Panel(Strict):
     @classmethod
     def further_faults(cls, data: dict[str, Any]) -> list[Any]:
         """Return faults in the layout of the parts that are valid by themselves, although other parts are not."""
-        parts: dict[Location, Light | PanelObject] = {}
+        parts: dict[Location, Part] = {}
         for key, model in _PARTS.items():
             table = data.get(key)
             for k, one in enumerate(table if isinstance(table, list) else ()):

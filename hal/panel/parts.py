@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -26,6 +27,43 @@ class Light(Strict):
     name: Name
     position_m: Vector3
     radius_m: Positive = 0.008
+
+
+TagFamily = Literal["16h5", "25h9", "36h10", "36h11"]
+QUIET_SHARE = 0.125
+"""Width of the white border around a tag's black square that the layout keeps free, as a share of the square's side."""
+
+
+class Tag(Strict):
+    """Printed AprilTag: a black square with a code, by which a camera finds the panel without border lights."""
+
+    id: Annotated[int, Field(ge=0, le=2319, description="number of the tag within its family")]
+    family: Annotated[TagFamily, Field(description="AprilTag family; 36h11 is read with the fewest mistakes")] = "36h11"
+    size_m: Annotated[
+        float, Field(gt=0.005, le=1.0, description="side of the printed black square, without its border")
+    ]
+    position_m: Annotated[
+        Vector3, Field(description="middle of the square (x, y) and height of the print above the plate (z)")
+    ]
+    angle_rad: Annotated[Angle, Field(description="turn of the print, clockwise as the viewer sees it")] = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name in reports and errors, for example `tag_36h11_4`."""
+        return f"tag_{self.family}_{self.id}"
+
+    @property
+    def half_foot_m(self) -> float:
+        """Half the side of the square with its white border."""
+        return (0.5 + QUIET_SHARE) * self.size_m
+
+    @property
+    def corners_m(self) -> tuple[Vector3, ...]:
+        """Corners of the black square in the panel frame, upper left of the upright print first and clockwise."""
+        x, y, z = self.position_m
+        c, s, half = math.cos(self.angle_rad), math.sin(self.angle_rad), self.size_m / 2
+        around = ((-half, half), (half, half), (half, -half), (-half, -half))
+        return tuple((x + c * u + s * v, y - s * u + c * v, z) for u, v in around)
 
 
 class Scale(Strict):

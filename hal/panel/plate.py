@@ -11,11 +11,11 @@ from pydantic_core import InitErrorDetails
 
 from hal.panel.angles import Location, fault
 from hal.panel.base import PanelObject
-from hal.panel.parts import Light, Vector2
+from hal.panel.parts import Light, Tag, Vector2
 
 OVERLAP_M = 0.001  # a smaller overlap of two parts is accepted, because drawings are rounded to millimetres
-PARTS = ("lights", "objects")
-Parts = Mapping[Location, Light | PanelObject]
+Part = Light | Tag | PanelObject
+Parts = Mapping[Location, Part]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,16 +85,19 @@ def _without_lamp(parts: Parts) -> Iterator[InitErrorDetails]:
             yield fault((*at, "lights_lamp"), lit, what, f"lamps: {', '.join(sorted(lamps)) or 'none'}")
 
 
-def _half_extent(part: Light | PanelObject) -> Vector2:
+def _half_extent(part: Part) -> Vector2:
     if isinstance(part, Light):
         return part.radius_m, part.radius_m
     foot = _foot(part)
     return foot.across(1.0, 0.0), foot.across(0.0, 1.0)
 
 
-def _foot(part: Light | PanelObject) -> _Foot:
+def _foot(part: Part) -> _Foot:
     if isinstance(part, Light):
         return _Foot(centre_m=part.position_m[:2], half_m=(part.radius_m, part.radius_m), is_round=True)
+    if isinstance(part, Tag):
+        half_m = (part.half_foot_m, part.half_foot_m)
+        return _Foot(centre_m=part.position_m[:2], half_m=half_m, turn_rad=-part.angle_rad)
     half = part.half_foot_m
     is_round = part.is_round or (part.rim is not None and part.rim.shape == "circle")
     return _Foot(centre_m=part.position_m, half_m=half, turn_rad=part.envelope().turn_rad, is_round=is_round)

@@ -19,9 +19,13 @@ if TYPE_CHECKING:
     from perception.vision.knowledge_files import kind_files, kind_text, load_kind, load_knowledge, write_kind
     from perception.vision.lights import AssignedLights, PanelPrior, find_panel, find_panel_lights
     from perception.vision.multi_view import merge_views
+    from perception.vision.panel_ways.looks import find_by_looks
+    from perception.vision.panel_ways.outline import find_by_outline
+    from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, compare
+    from perception.vision.panel_ways.tags import find_by_tags
     from perception.vision.photographs.reader import PhotographKind, read_photograph
     from perception.vision.projection import CameraProjection, PanelProjection
-    from perception.vision.quadrangle import QuadranglePose, estimate
+    from perception.vision.quadrangle import estimate
     from perception.vision.reading import ObjectReading, answer_at
     from perception.vision.registration.outline import contour_m
     from perception.vision.registration.rims import RimView, find_rims
@@ -34,19 +38,24 @@ __all__ = [
     "ObjectReading",
     "PanelPrior",
     "PanelProjection",
+    "PanelSighting",
+    "PanelWay",
     "PhotographKind",
-    "QuadranglePose",
     "RimView",
     "TaughtKind",
     "answer_at",
     "as_gray",
     "check_image",
     "check_upright",
+    "compare",
     "contour_m",
     "decode",
     "draw_annotated",
     "draw_outlines",
     "estimate",
+    "find_by_looks",
+    "find_by_outline",
+    "find_by_tags",
     "find_panel",
     "find_panel_lights",
     "find_rims",

@@ -113,7 +113,7 @@ OPERATIONS: dict[str, Operation] = {
             result_model=results.PanelPoseResult,
             run=_in_session("locate", "run_panel_pose"),
             needs=(DeviceKind.CAMERA, DeviceKind.LIGHTS, DeviceKind.RANGE_SCANNER),
-            summary="Locate the panel by its four lights; the answer is its pose with covariance",
+            summary="Locate the panel by lights, tags, outline or looks; the answer is its pose with covariance",
             example={"move": True},
         ),
         Operation(

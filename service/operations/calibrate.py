@@ -21,7 +21,8 @@ from service.operations.calibrate_sensors import (
     scanner_stations,
     tool_joints,
 )
-from service.operations.locate import go_to_overview, locate
+from service.operations.find_panel import locate
+from service.operations.locate import go_to_overview
 from service.operations.session import Session
 from service.operations.travel import kinematics, park
 from service.report.plots import stations_picture

@@ -31,7 +31,8 @@ from perception.calibration import (
 )
 from perception.vision import viewpoints
 from service.operations.acquisition import OLDEST_S, deadline, look_with_lights, settle
-from service.operations.locate import lights_in, scan_plate
+from service.operations.find_panel import lights_in
+from service.operations.locate import scan_plate
 from service.operations.session import Session
 from service.operations.travel import go_to_first, go_to_joints, kinematics, reachable
 

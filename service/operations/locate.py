@@ -1,4 +1,4 @@
-"""Locates the panel by its border lights, its plate by a range image, and its objects' rims by several images."""
+"""The verb `panel-pose`, the plane of the plate in a range image, and the rims of the objects in several images."""
 
 from __future__ import annotations
 
@@ -8,44 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion import PixelObservation, PlaneObservation, depth_before, triangulate, with_common_errors
-from hal.arrays import Array
 from hal.errors import NotFound, PerceptionError
-from hal.geometry import UncertainPose, compose, matrix_of
+from hal.geometry import compose
 from hal.panel import PanelObject, Rim
 from perception.range import PlaneFit, fit_plane_near
-from perception.vision import (
-    AssignedLights,
-    PanelPrior,
-    QuadranglePose,
-    RimView,
-    find_panel,
-    find_panel_lights,
-    find_rims,
-    viewpoints,
-)
-from service.operations.acquisition import LightPair, Look, Scan, look_with_lights, scan
+from perception.vision import PanelWay, RimView, find_rims, viewpoints
+from service.operations.acquisition import Look, Scan, scan
+from service.operations.find_panel import locate
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
 from service.schema.mission_results import ObjectDepth
 from service.schema.requests import PanelPoseRequest
 from service.schema.results import PanelPoseResult, PlateInScanner, estimated
-from service.world_model import expected_panel
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Located:
-    """The pose of the panel from its lights.
-
-    Attributes:
-        base_from_panel: the pose, with the covariance from image noise and camera mount.
-        lights_px: (4, 2) in the order of the panel file.
-    """
-
-    base_from_panel: UncertainPose
-    pose: QuadranglePose
-    pair: LightPair
-    lights_px: Array
-    observations: tuple[PixelObservation, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,64 +40,6 @@ def go_to_overview(session: Session) -> None:
     pose = session.believed_panel().parent_from_child
     lens = session.lens()
     go_to_camera_view(session, viewpoints.overview_poses(pose, session.panel, lens, slack_m), name="overview")
-
-
-def locate(session: Session) -> Located:
-    """Find the panel from the present pose of the arm and store its pose.
-
-    Raises:
-        NotFound, Ambiguous: lights are missing or wrong, or the panel cannot be where they are.
-    """
-    session.progress(0.3, "lights off, lights on")
-    pair = look_with_lights(session)
-    session.progress(0.8, "pose of the four lights")
-    found = locate_in(session, pair)
-    session.world.believe_panel(found.base_from_panel)
-    return found
-
-
-def locate_in(session: Session, pair: LightPair) -> Located:
-    """Return the panel's pose from a pair of images."""
-    look, workspace = pair.on, session.cell.file.workspace
-    camera_from_base = look.base_from_camera.parent_from_child.inv()
-    found = find_panel(
-        pair.off.pixels,
-        pair.on.pixels,
-        _lights_m(session),
-        look.intrinsics,
-        prior=PanelPrior(
-            camera_from_panel=camera_from_base * session.believed_panel().parent_from_child,
-            camera_from_expected=camera_from_base * expected_panel(session.cell).parent_from_child,
-            position_tolerance_m=workspace.position_tolerance_m,
-            angle_tolerance_rad=workspace.angle_tolerance_rad,
-        ),
-        lens_rms_px=session.lens_rms_px(look.camera),
-        light_sigma_m=session.panel.tolerances.light_m,
-    )
-    return Located(
-        base_from_panel=compose(look.base_from_camera, found.camera_from_panel),
-        pose=found.pose,
-        pair=pair,
-        lights_px=found.lights.points_px,
-        observations=_light_observations(session, look, found.lights.points_px, found.covariance_px),
-    )
-
-
-def lights_in(session: Session, pair: LightPair) -> AssignedLights:
-    """Find the panel's lights in a pair of images, in the order of the panel file.
-
-    Raises:
-        NotFound, Ambiguous: not all of them are visible, or other lights are in their places.
-    """
-    look = pair.on
-    upright = look.base_from_camera.parent_from_child.inv() * session.believed_panel().parent_from_child
-    return find_panel_lights(
-        pair.off.pixels, pair.on.pixels, _lights_m(session), look.intrinsics, upright=matrix_of(upright)
-    )
-
-
-def _lights_m(session: Session) -> Array:
-    return np.array([light.position_m for light in session.panel.lights])
 
 
 def scan_plate(session: Session) -> ScannedPlane:
@@ -252,35 +168,21 @@ def run_panel_pose(session: Session, request: PanelPoseRequest) -> PanelPoseResu
     if request.move:
         session.progress(0.05, "drive to the overview")
         go_to_overview(session)
-    found = locate(session)
+    found = locate(session, None if request.by is None else PanelWay(request.by))
     plate = None
     if request.scan:
         session.progress(0.9, "scan the plate")
         feature = scan_plate(session).fit.feature
         plate = PlateInScanner(point_m=feature.point_m.tolist(), normal=feature.direction.tolist())
-    lights = zip(session.panel.lights, found.lights_px, strict=True)
+    seen = found.seen
     return PanelPoseResult(
+        way=seen.way.value,
         base_from_panel=estimated(found.base_from_panel),
-        chi_square=found.pose.chi_square,
-        ambiguous=found.pose.ambiguous,
-        alternatives=len(found.pose.alternatives),
-        lights_px={light.name: pixel for light, pixel in lights},
+        checks=list(found.checks),
+        chi_square=seen.chi_square,
+        degrees_of_freedom=seen.degrees_of_freedom,
+        ambiguous=seen.ambiguous,
+        alternatives=seen.alternatives,
+        points_px={name: pixel.tolist() for name, pixel in zip(seen.names, seen.points_px, strict=True)},
         plate_in_scanner=plate,
-    )
-
-
-def _light_observations(
-    session: Session, look: Look, pixels: Array, covariances: Array
-) -> tuple[PixelObservation, ...]:
-    return tuple(
-        PixelObservation(
-            sensor=look.camera,
-            base_from_flange=look.base_from_flange,
-            name=light.name,
-            point_m=np.array(light.position_m),
-            pixel_px=pixel,
-            covariance_px=covariance,
-            intrinsics=look.intrinsics,
-        )
-        for light, pixel, covariance in zip(session.panel.lights, pixels, covariances, strict=True)
     )

@@ -15,34 +15,46 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, DeviceError, InvalidRequest
 from hal.geometry import compose
 from hal.panel import PanelObject, Shown
-from perception.vision import ObjectReading
+from perception.vision import ObjectReading, PanelWay
 from service.operations.acquisition import settle
 from service.operations.evaluate import AFTER
+from service.operations.find_panel import Located, locate, panel_observations, ways_of
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
 from service.operations.locate import (
-    Located,
     ScannedPlane,
     SeenRim,
     go_to_overview,
-    locate,
     object_depths,
     rim_observations,
     rims_in,
     scan_plate,
 )
 from service.operations.manipulate import work
-from service.operations.range_detection import OVERVIEW, check_surfaces, need_its_place, view_surfaces
-from service.operations.sense import feel, fuse_and_remember, fused_result, light_observations
+from service.operations.range_detection import (
+    OVERVIEW,
+    SurfaceView,
+    check_surfaces,
+    need_its_place,
+    view_surfaces,
+)
+from service.operations.sense import feel, fuse_and_remember, fused_result
 from service.operations.session import OperationContext, Session
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
 from service.report.drawing import panel_drawing
-from service.report.plots import joints_picture, lights_picture, png_of, range_picture, wrench_picture
+from service.report.plots import (
+    joints_picture,
+    lights_picture,
+    png_of,
+    points_picture,
+    range_picture,
+    wrench_picture,
+)
 from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
 from service.schema.mission_results import MissionResult, ObjectPlace, SurfaceCheck
 from service.schema.requests import ActionBody, MissionRequest
-from service.schema.results import FittedPlate, estimated
+from service.schema.results import FittedPlate, FoundBy, estimated
 
 log = logging.getLogger(__name__)
 BEFORE = "before the actions"
@@ -110,23 +122,7 @@ def _report(record: MissionRecord, folder: Path) -> bool:
 
 
 def _run(session: Session, record: MissionRecord, request: MissionRequest) -> None:
-    with _step(session, "overview", 0.0, 0.06) as part:
-        part.progress(0.0, "drive to the overview")
-        leave_the_panel(part)
-        session.world.forget()  # a mission uses only its own observations, because the panel may have been exchanged
-        go_to_overview(part)
-    with _step(session, "lights", 0.06, 0.10) as part:
-        first = locate(part)
-    with _step(session, "square view", 0.10, 0.16) as part:
-        part.progress(0.0, "drive to the square view")
-        go_to_overview(part)
-        located = locate(part)
-        _note_lights(session, record, located)
-    with _step(session, "scan", 0.16, 0.19) as part:
-        part.progress(0.0, "scan the plate")
-        plane = scan_plate(part)
-        _note_plane(record, plane)
-        by_surfaces = view_surfaces(part, plane, OVERVIEW)
+    first, located, plane, by_surfaces = _find(session, record)
     with _step(session, "recognise", 0.19, 0.22) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # until the border lights are out
@@ -140,25 +136,54 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         record.readings += [reading_result(reading, BEFORE) for reading in found.readings.values()]
         rims = rims_in(part, [view.look for view in (*overview.pictures, *found.pictures)])
     with _step(session, "touch", 0.38, 0.55) as part:
-        rays = (*light_observations([first, located]), *rim_observations(rims))
-        known: tuple[Observation, ...] = (*rays, plane.observation)
+        known: tuple[Observation, ...] = (*panel_observations([first, located]), *rim_observations(rims))
+        known = known if plane is None else (*known, plane.observation)
         felt = feel(part, request.touches, known, request.wanted.tolerance())
     with _step(session, "fuse", 0.55, 0.57) as part:
-        part.progress(0.0, "fuse rays to lights and rims, range plane, distances and touches")
+        part.progress(0.0, "fuse rays, range plane, distances and touches")
         answer = fuse_and_remember(part, (*known, *felt.observations))
         record.fused = fused_result(answer, felt)
-        record.by_lights = estimated(located.base_from_panel)
         record.pictures.append(_drawing(session, located))
         _note_depths(part, record, rims)
-    with _step(session, "check by surfaces", 0.57, 0.58) as part:
-        part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
-        checks, pictures = check_surfaces(part, by_surfaces)
-        record.by_surfaces = checks
-        record.pictures += pictures
+    checks: list[SurfaceCheck] = []
+    if by_surfaces is not None:
+        with _step(session, "check by surfaces", 0.57, 0.58) as part:
+            part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
+            checks, pictures = check_surfaces(part, by_surfaces)
+            record.by_surfaces = checks
+            record.pictures += pictures
     _work_all(session, record, request, checks)
     with _step(session, "retreat", 0.96, 1.0) as part:
         part.progress(0.0, "park")
         park(part)
+
+
+def _find(session: Session, record: MissionRecord) -> tuple[Located, Located, ScannedPlane | None, SurfaceView | None]:
+    """Find the panel twice, the second time from a square view, and scan its plate if there is a range scanner.
+
+    Returns: the panel from both views, and with a range scanner the plate and the objects with a relief.
+    """
+    with _step(session, "overview", 0.0, 0.06) as part:
+        part.progress(0.0, "drive to the overview")
+        leave_the_panel(part)
+        session.world.forget()  # a mission uses only its own observations, because the panel may have been exchanged
+        go_to_overview(part)
+    with _step(session, "lights" if PanelWay.LIGHTS in ways_of(session) else "find the panel", 0.06, 0.10) as part:
+        first = locate(part)
+    with _step(session, "square view", 0.10, 0.16) as part:
+        part.progress(0.0, "drive to the square view")
+        go_to_overview(part)
+        located = locate(part)
+        _note_found(record, located)
+    plane: ScannedPlane | None = None
+    by_surfaces: SurfaceView | None = None
+    if session.cell.names_of(DeviceKind.RANGE_SCANNER):
+        with _step(session, "scan", 0.16, 0.19) as part:
+            part.progress(0.0, "scan the plate")
+            plane = scan_plate(part)
+            _note_plane(record, plane)
+            by_surfaces = view_surfaces(part, plane, OVERVIEW)
+    return first, located, plane, by_surfaces
 
 
 def _work_all(session: Session, record: MissionRecord, request: MissionRequest, checks: Sequence[SurfaceCheck]) -> None:
@@ -230,10 +255,17 @@ def _finish(record: MissionRecord) -> None:
         )
 
 
-def _note_lights(session: Session, record: MissionRecord, found: Located) -> None:
-    names = [light.name for light in session.panel.lights]
-    png = lights_picture(found.pair.off.pixels, found.pair.on.pixels, found.lights_px, names)
-    record.pictures.append(Picture(name="lights", title="lights off, lights on, and their difference", png=png))
+def _note_found(record: MissionRecord, found: Located) -> None:
+    record.found_by = FoundBy(
+        way=found.seen.way.value, base_from_panel=estimated(found.base_from_panel), checks=list(found.checks)
+    )
+    seen = found.seen
+    if found.lit is not None:
+        png = lights_picture(found.look.pixels, found.lit.pixels, seen.points_px, seen.names)
+        record.pictures.append(Picture(name="lights", title="lights off, lights on, and their difference", png=png))
+        return
+    png = points_picture(found.look.pixels, seen.points_px, seen.names)
+    record.pictures.append(Picture(name="found", title=f"the points that show the panel by its {seen.way}", png=png))
 
 
 def _note_plane(record: MissionRecord, plane: ScannedPlane) -> None:
@@ -279,7 +311,7 @@ def _places(session: Session, found: Inspection) -> list[ObjectPlace]:
 
 def _drawing(session: Session, located: Located) -> Picture:
     """Draw the panel's outlines in the fused pose over the image, as in the paper's Fig. 13."""
-    look = located.pair.off
+    look = located.look
     camera_from_panel = compose(look.base_from_camera.inverse(), session.known_panel())
     png = panel_drawing(session.panel, camera_from_panel.parent_from_child, look.intrinsics, look.pixels)
     return Picture(name="pose", title="line drawing of the panel in its fused pose over the camera's image", png=png)

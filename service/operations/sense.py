@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion import (
     FusedObservations,
     Observation,
-    PixelObservation,
     PoseTolerance,
     ProximityObservation,
     SensingChoice,
@@ -32,8 +31,9 @@ from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
 from manipulation import SkillFailure, plausibility, proximity_probe, touch_points, touch_probe
 from service.operations.acquisition import settle
+from service.operations.find_panel import Located, locate, panel_observations
 from service.operations.inspect import ensure_located
-from service.operations.locate import Located, go_to_overview, locate, scan_plate
+from service.operations.locate import go_to_overview, scan_plate
 from service.operations.session import Session
 from service.operations.travel import skill_context
 from service.schema.fuse_request import FuseRequest
@@ -95,15 +95,12 @@ def collect(session: Session, request: FuseRequest) -> tuple[tuple[Observation, 
     ensure_located(session.part(0.0, 0.2))
     go_to_overview(session)
     found: Located = locate(session.part(0.2, 0.3))
-    session.progress(0.3, "scan the plate")
-    known: tuple[Observation, ...] = (*found.observations, scan_plate(session).observation)
+    known: tuple[Observation, ...] = panel_observations([found])
+    if session.cell.names_of(DeviceKind.RANGE_SCANNER):
+        session.progress(0.3, "scan the plate")
+        known = (*known, scan_plate(session).observation)
     felt = feel(session.part(0.35, 1.0), request.touches, known, request.wanted.tolerance())
     return (*known, *felt.observations), felt
-
-
-def light_observations(located: Sequence[Located]) -> tuple[PixelObservation, ...]:
-    """Return the rays to the lights from several image pairs together."""
-    return tuple(ray for found in located for ray in found.observations)
 
 
 def feel(session: Session, touches: int, known: Sequence[Observation], tolerance: PoseTolerance) -> Felt:

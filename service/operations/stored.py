@@ -21,7 +21,7 @@ from service.schema.requests import InspectRequest, RecogniseRequest, StoredLook
 from service.schema.results import CandidateResult, InspectResult, ObjectResult, PossibleNumber, RecogniseResult
 
 if TYPE_CHECKING:
-    from perception.vision import PanelProjection
+    from perception.vision import Knowledge, PanelProjection
 
 Pixels = NDArray[np.uint8]
 PICTURE_WIDTH_PX = 1600  # wider pictures are reduced to this width for display
@@ -73,7 +73,7 @@ def blind_answer(
     """Return all candidates, the refused ones with their reasons, and a picture of the others."""
     from perception.vision import draw_outlines, recognise
 
-    found = recognise(pixels, _stores(session)[1].knowledge(), plate_m=plate_m, focal_px=focal_px)
+    found = recognise(pixels, knowledge_of(session), plate_m=plate_m, focal_px=focal_px)
     taken = [candidate for candidate in found if candidate.reason is None]
     texts = [f"{candidate.kind} {candidate.confidence:.2f}" for candidate in taken]
     outlined = draw_outlines(pixels, [candidate.box_px for candidate in taken], texts, [True] * len(taken))
@@ -126,6 +126,11 @@ def shown(picture: Pixels) -> Pixels:
         return picture
     scale = PICTURE_WIDTH_PX / width
     return np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def knowledge_of(session: Session) -> Knowledge:
+    """Return the looks that ship with the system, those of the cell, and those that were taught."""
+    return _stores(session)[1].knowledge()
 
 
 def _stores(session: Session) -> tuple[ImageStore, KnowledgeStore]:

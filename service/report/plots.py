@@ -51,6 +51,18 @@ def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any]
     return figure_png(figure)
 
 
+def points_picture(image: Pixels, points_px: NDArray[Any], names: Sequence[str]) -> bytes:
+    """Draw an image with the points that show where the panel is."""
+    figure = _sheet(4.6)
+    pane = figure.subplots()
+    pane.imshow(image, cmap="gray", vmin=0, vmax=255)
+    pane.set_axis_off()
+    for (u, v), name in zip(points_px, names, strict=True):
+        pane.plot(u, v, "o", ms=5, mfc="none", mec="#ff9f1c")
+        pane.annotate(name, (u, v), xytext=(0, 6), textcoords="offset points", color="#ff9f1c", fontsize=5, ha="center")
+    return figure_png(figure)
+
+
 def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     """Draw the range image and its residuals from the fitted plane."""
     figure = _sheet(4.2)

@@ -13,10 +13,10 @@ from hal.motion import MotionReport
 from service.problem import ProblemFields
 from service.schema.fuse_results import FuseResult
 from service.schema.mission_results import ActionResult, ObjectDepth, ObjectPlace, ReadingResult, SurfaceCheck
-from service.schema.results import EstimatedPose, FittedPlate
+from service.schema.results import FittedPlate, FoundBy
 
 # Fields of a record that appear in a report once they are known.
-FINDINGS = ("plate_in_scanner", "objects", "fused", "by_lights", "by_surfaces", "depths", "not_parked")
+FINDINGS = ("plate_in_scanner", "objects", "fused", "found_by", "by_surfaces", "depths", "not_parked")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +47,7 @@ class MissionRecord:
         now_s: the cell's clock.
         plate_in_scanner: the plate's plane in the first scan.
         objects: the position of each object in 3-D.
-        fused, by_lights: the panel's pose from all sensors, and from its lights alone.
+        fused, found_by: the panel's pose from all sensors, and from the camera alone.
         by_surfaces: results from the objects' surfaces, in addition to layout and vision.
         depths: how far the objects stand out of the plate by several camera views, beside the panel file.
         not_parked: why the arm was not parked after an error.
@@ -68,7 +68,7 @@ class MissionRecord:
     plate_in_scanner: FittedPlate | None = None
     objects: list[ObjectPlace] | None = None
     fused: FuseResult | None = None
-    by_lights: EstimatedPose | None = None
+    found_by: FoundBy | None = None
     by_surfaces: list[SurfaceCheck] | None = None
     depths: list[ObjectDepth] | None = None
     not_parked: str | None = None

@@ -59,11 +59,15 @@ class PoseBody(Strict):
 
 
 class PanelPoseRequest(Strict):
-    """Locate the panel by its four lights."""
+    """Locate the panel by its border lights; without lights by printed tags, its outline, or its objects' looks."""
 
     move: Annotated[
         bool, Field(description="drive to a view of the whole panel first; if false, the arm stays where it is")
     ] = True
+    by: Annotated[
+        Literal["lights", "tags", "outline", "looks"] | None,
+        Field(description="only this way; if null, the lights, or else the first of the others that finds it"),
+    ] = None
     scan: Annotated[bool, Field(description="also fit the plate's plane to a range image")] = False
 
 

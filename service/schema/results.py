@@ -6,7 +6,7 @@ A field is null if it does not apply to the request.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -62,6 +62,8 @@ def fields_of(result: Result) -> dict[str, Any]:
     return {name: getattr(result, name) for name in type(result).model_fields}
 
 
+PanelBy = Literal["lights", "tags", "outline", "looks"]
+
 # -- panel-pose -------------------------------------------------------------------------------------------------------
 
 
@@ -78,14 +80,35 @@ class FittedPlate(PlateInScanner):
     rms_m: float
 
 
-class PanelPoseResult(Result):
-    """The pose of the panel from its four lights."""
+class PanelCheck(Result):
+    """What another way of finding the panel says in the same image."""
 
+    way: PanelBy
+    position_m: Annotated[
+        float | None, Field(description="distance of its pose; null if it did not find the panel")
+    ] = None
+    angle_rad: float | None = None
+    chi_square: Annotated[float | None, Field(description="of the difference, with 6 degrees of freedom")] = None
+    contradicts: Annotated[bool, Field(description="the difference is too large for the stated errors of both")]
+    finding: str
+
+
+class FoundBy(Result):
+    """The pose of the panel from the camera alone: how it was found, and what the other ways say."""
+
+    way: PanelBy
     base_from_panel: EstimatedPose
-    chi_square: Annotated[float, Field(description="chi-square of the fit, with 2 degrees of freedom")]
+    checks: list[PanelCheck]
+
+
+class PanelPoseResult(FoundBy):
+    """The pose of the panel from one pose of the camera."""
+
+    chi_square: float
+    degrees_of_freedom: int
     ambiguous: bool
     alternatives: int
-    lights_px: dict[str, Numbers]
+    points_px: Annotated[dict[str, Numbers], Field(description="the lights, corners or rims that gave the pose")]
     plate_in_scanner: Annotated[PlateInScanner | None, Field(description="with `scan`")] = None
 
 

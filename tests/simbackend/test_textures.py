@@ -65,7 +65,7 @@ def test_ten_digits_make_ten_pictures() -> None:
 
 def test_the_plate_is_light_and_printed(tmp_path: Path) -> None:
     panel = load_panel(ROOT / "panels" / "bench.toml")
-    plate = grey(textures.plate(panel))
+    plate = grey(textures.plate(panel, (panel.width_m, panel.height_m), (0.0, 0.0)))
     assert plate.shape == (round(panel.height_m * 2600), round(panel.width_m * 2600))
     assert np.median(plate) > 190
     assert 0.01 < np.mean(plate < 90) < 0.15

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,22 +151,39 @@ def warm_up() -> None:
     assign_lights(blobs, lights, image_size_px=(640, 480))
 
 
-def _plausible(pose: QuadranglePose, prior: PanelPrior) -> UncertainPose:
-    """Return the pose that the prior allows, if there is exactly one."""
-    candidates = [(pose.camera_from_object, pose.covariance)]
-    if pose.ambiguous and prior.camera_from_expected is not None:
-        candidates += [(a.camera_from_object, a.covariance) for a in pose.alternatives if a.covariance is not None]
-    fitting = [candidate for candidate in candidates if prior.allows(candidate[0])]
+def allowed_pose(poses: Sequence[UncertainPose], prior: PanelPrior, *, ambiguous: bool, by: str) -> UncertainPose:
+    """Return the pose that the prior allows, if there is exactly one.
+
+    Args:
+        poses: most likely first; the others count only if the answer is `ambiguous`.
+        by: what the panel was found by, for errors.
+
+    Raises:
+        NotFound: the prior allows none of them.
+        Ambiguous: it allows several.
+    """
+    candidates = poses if ambiguous and prior.camera_from_expected is not None else poses[:1]
+    fitting = [pose for pose in candidates if prior.allows(pose.parent_from_child)]
     if not fitting:
-        offset = prior.offset(pose.camera_from_object)
+        offset = prior.offset(poses[0].parent_from_child)
         raise NotFound(
-            f"the lights put the panel {np.linalg.norm(offset[:3]):.3f} m and {np.linalg.norm(offset[3:]):.3f} rad from"
+            f"the {by} put the panel {np.linalg.norm(offset[:3]):.3f} m and {np.linalg.norm(offset[3:]):.3f} rad from"
             " where the cell file expects it",
             hint="correct workspace.panel_position_m and panel_rpy_rad, or widen their tolerances",
         )
     if len(fitting) > 1:
         raise Ambiguous(
-            "two panel poses fit the four lights equally well",
+            f"two panel poses fit the {by} equally well",
             hint="look from another side: tilt the camera 15 degrees or come nearer",
         )
-    return UncertainPose(parent_from_child=fitting[0][0], covariance=fitting[0][1])
+    return fitting[0]
+
+
+def _plausible(pose: QuadranglePose, prior: PanelPrior) -> UncertainPose:
+    """Return the pose of the lights that the prior allows."""
+    others = [
+        UncertainPose(parent_from_child=a.camera_from_object, covariance=a.covariance)
+        for a in pose.alternatives
+        if a.covariance is not None
+    ]
+    return allowed_pose([pose.uncertain, *others], prior, ambiguous=pose.ambiguous, by="four lights")

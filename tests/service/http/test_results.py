@@ -83,7 +83,14 @@ def test_a_pose_is_given_with_the_sigma_of_each_axis() -> None:
         parent_from_child=RigidTransform.from_translation([0.1, 0.2, 0.3]), covariance=np.diag([1, 4, 9, 16, 25, 36.0])
     )
     answer = PanelPoseResult(
-        base_from_panel=estimated(pose), chi_square=1.5, ambiguous=False, alternatives=0, lights_px={"a": [1.0, 2.0]}
+        way="lights",
+        base_from_panel=estimated(pose),
+        checks=[],
+        chi_square=1.5,
+        degrees_of_freedom=2,
+        ambiguous=False,
+        alternatives=0,
+        points_px={"a": [1.0, 2.0]},
     )
     plain = jsonable(answer)
     assert plain["base_from_panel"]["sigma_m"] == [1.0, 2.0, 3.0]

@@ -19,8 +19,9 @@ from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
 from service.operations.acquisition import look, settle
 from service.operations.evaluate import evaluate
+from service.operations.find_panel import locate
 from service.operations.inspect import look_close
-from service.operations.locate import go_to_overview, locate, object_depths, rims_in, scan_plate
+from service.operations.locate import go_to_overview, object_depths, rims_in, scan_plate
 from service.operations.mission import run_mission
 from service.operations.range_detection import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
 from service.operations.session import OperationContext, Session

@@ -16,7 +16,8 @@ from hal.devices import RangeScannerCapabilities
 from hal.errors import DeviceError, StaleReading, Unsupported
 from hal.simulated import Fault
 from service.operations.acquisition import scan, sweep_rate_rad_per_s, sweep_scanner
-from service.operations.locate import ScannedPlane, go_to_overview, locate, plate_in
+from service.operations.find_panel import locate
+from service.operations.locate import ScannedPlane, go_to_overview, plate_in
 from service.operations.range_detection import Sighting, find_by_surfaces, surfaces_in
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime

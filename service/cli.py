@@ -48,6 +48,7 @@ def _app() -> Callable[[], None]:
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
     from service.commands.drivers import drivers
+    from service.commands.foxglove import foxglove
     from service.commands.init import init
     from service.commands.journal import journal
     from service.commands.learn import learn
@@ -71,6 +72,7 @@ def _app() -> Callable[[], None]:
     app.command()(demo)
     app.command()(record)
     app.command()(replay)
+    app.command()(foxglove)
     app.command()(doctor)
     app.add_typer(devices.app, name="devices")
     app.command()(drivers)

@@ -182,9 +182,10 @@ class Ft300Registers(ModbusDevice[Wrench]):
 
     def prepare(self, client: ModbusMaster) -> None:
         """Check that the device is the sensor."""
+        client.meet(self._options.unit)  # wrenches have six registers
         identify(client, self._options.unit)
 
-    def poll(self, client: ModbusMaster) -> None:
+    def take_reading(self, client: ModbusMaster) -> None:
         """Read the six registers."""
         unit, until_s = self._options.unit, now_s() + client.attempt_s
         words = client.read_registers(unit=unit, address=WRENCH_REGISTER, count=6, until_s=until_s)

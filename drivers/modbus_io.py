@@ -115,7 +115,7 @@ class IoDevice(ModbusDevice[T]):
         super().__init__(context, options)
         self._io = options
 
-    def poll(self, client: ModbusMaster) -> None:
+    def take_reading(self, client: ModbusMaster) -> None:
         """Read all inputs in one request."""
         io = self._io
         inputs = client.read_bits(unit=io.unit, address=0, count=io.inputs, until_s=now_s() + client.attempt_s)
@@ -158,6 +158,7 @@ class IoLights(IoDevice[tuple[bool, ...]]):
     def prepare(self, client: ModbusMaster) -> None:
         """Restore the last commanded state of the lights after a loss."""
         if self._wanted is not None:
+            client.meet(self._io.unit)  # inputs are read by another function
             self._write(client, self._wanted, now_s() + client.attempt_s)
 
     def take(self, inputs: tuple[bool, ...], valid_s: float) -> None:

@@ -181,7 +181,7 @@ class Robotiq2F(ModbusDevice[GripperState]):
     def _soon(self) -> Deadline:
         return Deadline.after(self.context.clock, 6 * self._options.timeout_s)
 
-    def poll(self, client: ModbusMaster) -> None:
+    def take_reading(self, client: ModbusMaster) -> None:
         """Read three registers and publish width and grip."""
         status = self._status(client, now_s() + client.attempt_s)
         if status.fault > ACTIVATION_PENDING and status.fault not in PASSING_FAULTS:

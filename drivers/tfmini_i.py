@@ -99,10 +99,11 @@ class ModbusTfmini(ModbusDevice[float]):
     def prepare(self, client: ModbusMaster) -> None:
         """Check by the firmware registers that the device is the sensor."""
         self._clock.reset()
+        client.meet(self._options.unit)  # readings have five registers
         until_s = now_s() + client.attempt_s
         client.read_registers(unit=self._options.unit, address=FIRMWARE_REGISTER, count=2, until_s=until_s)
 
-    def poll(self, client: ModbusMaster) -> None:
+    def take_reading(self, client: ModbusMaster) -> None:
         """Read distance, strength and clock in one request; skip a measurement that was read before."""
         unit, until_s = self._options.unit, now_s() + client.attempt_s
         words = client.read_registers(unit=unit, address=READING_REGISTER, count=5, until_s=until_s)

@@ -13,6 +13,7 @@ from benchmarks.drivers.faults import part_faults
 from benchmarks.drivers.fuzz import part_fuzz
 from benchmarks.drivers.life import part_isolation, part_reconnect
 from benchmarks.drivers.motion import part_csp, part_kill, part_ur
+from benchmarks.drivers.sessions import part_sessions
 from benchmarks.drivers.stamps import part_stamps
 from benchmarks.drivers.swap import part_swap
 from benchmarks.drivers.wire import part_decode, part_latency, part_rtu
@@ -26,6 +27,7 @@ PARTS: dict[str, Callable[[float], None]] = {
     "can": part_can,
     "stamps": part_stamps,
     "reconnect": part_reconnect,
+    "sessions": part_sessions,
     "swap": part_swap,
     "isolation": part_isolation,
     "ur": part_ur,

@@ -164,6 +164,7 @@ class DynamixelArm(PolledDevice[JointState, DynamixelClient]):
         self._filter.close()
         ids = self._options.ids
         client.sync_write(STATUS_RETURN, 1, dict.fromkeys(ids, ALWAYS), now_s() + self._options.timeout_s)
+        client.meet()
         with naming_alerts(client, ids, client.until_s(2 * len(ids), 2 * PACKET_BYTES)):
             modes = self._read_modes(client)
         for id_, mode in modes.items():

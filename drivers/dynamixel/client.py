@@ -27,6 +27,7 @@ PACKET_BYTES = 10  # header, id, length, instruction, CRC
 HARDWARE_BITS = {0: "supply voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
 REBOOT = "remove the cause, then switch the servo's power off and on, because only a reboot clears this error"
 PROBES = range(1, 13)  # lengths of a read from address 0, where no servo has gaps
+FIRST_PROBES = (12, 11, 9)  # no device reads as many bytes of one servo
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +72,18 @@ class DynamixelClient:
     A status packet does not say which request it answers, so no request is sent whose answer could be confused with a
     lost one. A block of all servos is requested with the ids in a different order each time. Other requests wait for
     the late answer; if it does not come, a block of a length that no lost answer has is read first: a bus answers in
-    order, so whatever follows that answer is new. After two lost answers there is a pause, or a slow bus would never
+    order, so whatever follows that answer is new. The first request is preceded by such a probe too, because an answer
+    to whoever had the port before may still come. After two lost answers there is a pause, or a slow bus would never
     catch up.
+
+    Args:
+        is_clear: whether it is certain that nobody had asked anything on this line before.
     """
 
-    def __init__(self, link: Link, *, timeout_s: float) -> None:
+    def __init__(self, link: Link, *, timeout_s: float, is_clear: bool = False) -> None:
         self._link = link
+        self._is_clear = is_clear
+        self._is_probe = False
         self._timeout_s = timeout_s
         self._fast_sizes: set[int] = set()
         self._framer = protocol.framer(self._fast_sizes)
@@ -86,6 +93,10 @@ class DynamixelClient:
         self._why = ""
         self._turn = 0
         self.asked_s = 0.0  # when the last request was sent
+
+    def meet(self) -> None:
+        """Send no probe before the next request: its answer has a form that is asked for at a session's start only."""
+        self._is_probe = True
 
     def read(self, id_: int, address: int, length: int, until_s: float) -> bytes:
         """Read a block of one servo."""
@@ -145,8 +156,11 @@ class DynamixelClient:
             try:
                 self._wait_for_late(until_s)
                 frame, shape = request()
-                if self._is_awaited(shape):
-                    self._probe(ids[0], until_s)
+                is_probe, self._is_probe = self._is_probe, False
+                if not (self._is_clear or is_probe):
+                    self._probe(ids[0], FIRST_PROBES, until_s)
+                elif self._is_awaited(shape):
+                    self._probe(ids[0], PROBES, until_s)
                 return self._attempt(frame, shape, ids, until_s)
             except NoAnswer:
                 if until_s - now_s() < 0.5 * self._timeout_s:
@@ -189,6 +203,7 @@ class DynamixelClient:
         self._overtaken += [(self.asked_s, lost) for lost in self._unanswered if lost != shape]
         self._unanswered.clear()
         self._lost_in_a_row = 0
+        self._is_clear = True
 
     def _is_awaited(self, shape: Shape) -> bool:
         return any(set(shape) & set(lost) for lost in self._unanswered)
@@ -216,21 +231,21 @@ class DynamixelClient:
             if not chunk and until_s < end_s:
                 raise NoAnswer(self._why)
 
-    def _probe(self, id_: int, until_s: float) -> None:
+    def _probe(self, id_: int, lengths: Iterable[int], until_s: float) -> None:
         """Send a request that no lost answer fits, so that later answers cannot be confused.
 
         Raises:
             NoAnswer: the line is not known to be clear yet.
         """
-        shapes = [(Part(id_, 1 + length),) for length in PROBES]
+        shapes = [(Part(id_, 1 + length),) for length in lengths]
         free = [shape for shape in shapes if not self._is_awaited(shape)]
         if not free:  # the servo is off, or so slow that it must be given time
             drain_until_quiet(self._link, quiet_s=self._timeout_s + QUARANTINE_S, until_s=until_s)
-            self._unanswered.clear()
-            return
-        with suppress(Refused):  # an error report is an answer too
-            self._attempt(protocol.read(id_, 0, free[0][0].size - 1), free[0], (id_,), until_s)
+        else:
+            with suppress(Refused):  # an error report is an answer too
+                self._attempt(protocol.read(id_, 0, free[0][0].size - 1), free[0], (id_,), until_s)
         self._unanswered.clear()
+        self._is_clear = True
 
     def _note_late(self, packets: Iterable[protocol.Packet]) -> None:
         """Handle answers to abandoned requests: these and earlier requests are no longer waited for."""

@@ -97,6 +97,12 @@ class ModbusMaster(ABC):
         """Read `count` holding (function 3) or input (4) registers, unsigned."""
         return tuple(self._ask(unit, self._pdus.read_registers(function, address, count), until_s).registers)
 
+    def meet(self, unit: int) -> None:  # noqa: B027  # TCP needs no probe
+        """Send no probe before the next request: its answer has a form that nothing else is asked for in.
+
+        The device answers in order, so that whatever follows that answer is new.
+        """
+
     def write_coils(self, *, unit: int, address: int, values: Sequence[bool], until_s: float) -> None:
         """Write consecutive coils (function 15)."""
         self._ask(unit, self._pdus.write_bits(address, values), until_s)
@@ -250,6 +256,7 @@ class ModbusRtu(ModbusMaster):
         self._is_clear = is_clear
         self._quiet_since_s = 0.0
         self._unanswered: set[tuple[int, int]] = set()  # (unit, function)
+        self._own_probe: int | None = None  # unit whose next request needs no probe before it
         self._met: set[int] = set()  # units whose answers are known to be of this session
 
     @property
@@ -266,7 +273,8 @@ class ModbusRtu(ModbusMaster):
         return self._identities.get(unit)
 
     def _exchange(self, unit: int, question: Question, until_s: float) -> ModbusPDU:
-        if self._unanswered or not (self._is_clear or unit in self._met):
+        is_probe, self._own_probe = self._own_probe == unit, None
+        if self._unanswered or not (self._is_clear or is_probe or unit in self._met):
             self._clean(unit, question, until_s)
         return self._transact(unit, question, until_s)
 
@@ -310,7 +318,7 @@ class ModbusRtu(ModbusMaster):
                 f"late answers to earlier requests still arrive; `timeout_s` = {self._timeout_s:g} s may be too short"
             )
             raise NoAnswer(f"{self._link.name}, unit {unit}: {late}")
-        self._meet(unit)
+        self._heard(unit)
 
     def _probe(self, unit: int, function: int, until_s: float) -> None:
         with contextlib.suppress(Refused, Busy):  # an exception is an answer too
@@ -350,12 +358,16 @@ class ModbusRtu(ModbusMaster):
                 frame = buffer[at : at + size]
                 if len(frame) == size > 2 and crc_modbus(frame[:-2]) == frame[-2] | frame[-1] << 8:
                     self._quiet_since_s = now_s()
-                    self._meet(unit)
+                    self._heard(unit)
                     return frame[1:-2]
                 at = buffer.find(start, at + 1)
         return b""
 
-    def _meet(self, unit: int) -> None:
+    def meet(self, unit: int) -> None:
+        """Send no probe before the next request to this unit, if it is the first of the session."""
+        self._own_probe = unit
+
+    def _heard(self, unit: int) -> None:
         """Record that whatever this unit sends from now on answers a later request."""
         self._met.add(unit)
         self._unanswered = {lost for lost in self._unanswered if lost[0] != unit}

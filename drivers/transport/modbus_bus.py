@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, ClassVar, Self, TypeVar
 
 from pydantic import Field, model_validator
@@ -65,27 +66,46 @@ def modbus_bus(context: Context, options: ModbusOptions) -> Bus[ModbusMaster]:
 
 
 class ModbusDevice(PolledDevice[T, ModbusMaster]):
-    """Device on a Modbus bus; it is asked who it is, and then as its driver defines."""
+    """Device on a Modbus bus; the subclass defines how it is prepared and read."""
 
     def __init__(self, context: Context, options: ModbusOptions) -> None:
         bus = modbus_bus(context, options)
         super().__init__(context, bus, rate_hz=options.rate_hz, max_age_s=options.max_age_s)
         self._unit = options.unit
         self._product = options.product
+        self._has_asked = False
 
     def set_up(self, client: ModbusMaster) -> None:
-        """Ask who the device is, compare that with the option `product`, and prepare it."""
-        identity = client.identity(self._unit, now_s() + client.attempt_s)
-        self.identified = str(identity or "")
-        if self._product is not None and self._product not in self.identified:
-            says = f"says that it is {self.identified!r}" if identity else "does not say what it is (function 43/14)"
-            raise DeviceFault(
-                f"{self.name}: unit {self._unit} {says}, not {self._product!r}",
-                hint="check port and unit number, or correct the option `product`",
-                device=self.name,
-                link=self.link_name(),
-            )
+        """Compare what the device says of itself with the option `product`, if that is given, and prepare it."""
+        if self._product is not None:
+            self._identify(client)
+            self._require(self._product)
         self.prepare(client)
 
+    def poll(self, client: ModbusMaster) -> None:
+        """Take a reading; after the first one ask who the device is, for people who look at its health."""
+        self.take_reading(client)
+        if not self._has_asked:
+            self._identify(client)
+
     def prepare(self, client: ModbusMaster) -> None:
-        """Configure the device; called again after each loss of the bus. Nothing is to be done unless overridden."""
+        """Check and configure the device; called again after each loss of the bus. By default nothing is to be done."""
+
+    @abstractmethod
+    def take_reading(self, client: ModbusMaster) -> None:
+        """Request the newest values and publish them."""
+
+    def _identify(self, client: ModbusMaster) -> None:
+        self._has_asked = True
+        self.identified = str(client.identity(self._unit, now_s() + client.attempt_s) or "")
+
+    def _require(self, product: str) -> None:
+        if product in self.identified:
+            return
+        says = f"says that it is {self.identified!r}" if self.identified else "does not say what it is (function 43/14)"
+        raise DeviceFault(
+            f"{self.name}: unit {self._unit} {says}, not {product!r}",
+            hint="check port and unit number, or correct the option `product`",
+            device=self.name,
+            link=self.link_name(),
+        )

@@ -65,7 +65,7 @@ def answer(packet: protocol.Packet, number: int) -> bytes:
 
 def client_of(fate: Fate) -> tuple[Bus, DynamixelClient]:
     bus = Bus(fate)
-    return bus, DynamixelClient(cast(Link, bus), timeout_s=0.002)
+    return bus, DynamixelClient(cast(Link, bus), timeout_s=0.002, is_clear=True)
 
 
 def soon() -> float:
@@ -111,6 +111,16 @@ def test_no_late_answer_of_one_servo_is_taken_on_a_bus_that_keeps_order(late: li
         assert block[0] == len(bus.asked)
 
 
+def test_the_first_answer_of_a_session_was_asked_for_in_it() -> None:
+    """The port was opened again while an answer of the session before was still on its way."""
+    old = protocol.encode(2, protocol.STATUS, bytes(11))
+    bus = Bus(lambda number, whole: [(0, old * (number == 1) + whole)])
+    client = DynamixelClient(cast(Link, bus), timeout_s=0.002)
+    assert client.read(2, 126, 10, soon()) == bytes([2]) * 10
+    assert client.read(2, 126, 10, soon()) == bytes([3]) * 10
+    assert len(bus.asked) == 3  # the first was a probe
+
+
 def test_an_answer_given_twice_counts_once() -> None:
     bus, client = client_of(lambda _, whole: [(0, whole), (1, whole)])
     for _ in range(5):
@@ -141,7 +151,7 @@ class SlowLine(Bus):
 
 
 def test_an_answer_has_the_time_that_its_bytes_take_on_the_line() -> None:
-    client = DynamixelClient(cast(Link, SlowLine(lambda _, whole: [(0, whole)])), timeout_s=0.002)
+    client = DynamixelClient(cast(Link, SlowLine(lambda _, whole: [(0, whole)])), timeout_s=0.002, is_clear=True)
     assert client.fast_sync_read(IDS, 126, 10, client.until_s(1, 150))[6][0] == 1
 
 

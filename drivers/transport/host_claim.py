@@ -11,6 +11,7 @@ import errno
 import os
 import socket
 import sys
+from hashlib import sha256
 from pathlib import Path
 
 SOCKETS = Path("/proc/net/unix")
@@ -41,7 +42,7 @@ class HostClaim:
         self._held: dict[str, tuple[socket.socket, socket.socket]] = {}
 
     def take(self, resource: str) -> None:
-        """Take `resource`, a name of at most 40 characters; a second call for the same one does nothing.
+        """Take `resource`; a second call for the same one does nothing.
 
         Raises:
             TakenBy: another holder has it.
@@ -49,7 +50,7 @@ class HostClaim:
         if resource in self._held or sys.platform != "linux":
             return
         try:
-            claim = _bound(f"panelwright claim {resource}")
+            claim = _bound(f"panelwright claim {_short(resource)}")
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise TakenBy(_owner_of(resource)) from None
@@ -64,8 +65,12 @@ class HostClaim:
                 sock.close()
 
 
+def _short(resource: str) -> str:
+    return sha256(resource.encode()).hexdigest()[:16]
+
+
 def _described(resource: str) -> str:
-    return f"panelwright owner of {resource}: "
+    return f"panelwright owner {_short(resource)}: "
 
 
 def _bound(name: str) -> socket.socket:

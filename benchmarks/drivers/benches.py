@@ -36,6 +36,7 @@ from drivers.emulators import (
     modbus_io,
     netft,
     robotiq_2f,
+    ros2,
     rplidar,
     scip,
     scripted,
@@ -69,6 +70,7 @@ class Bench:
 
 
 WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
+WITHOUT_ECHO = tuple(f for f in WireFault if f is not WireFault.ECHO)  # of a two-wire line; a WebSocket server has none
 FAST_SCAN = {"scans_per_minute": 2400}
 BENCHES = (
     Bench(
@@ -212,6 +214,32 @@ BENCHES = (
         is_true=true_joints,
         options={"rate_hz": 125.0},
         stamps="taken",
+    ),
+    Bench(
+        name="ros2 arm",
+        start=ros2.start,
+        backing=MovingArm,
+        driver="ros2:arm",
+        taken_s=taken_s,
+        is_true=true_joints,
+        faults=WITHOUT_ECHO,
+    ),
+    Bench(
+        name="ros2 force_torque",
+        start=ros2.start,
+        backing=TimedForceTorque,
+        driver="ros2:force_torque",
+        taken_s=taken_s,
+        is_true=true_wrench,
+        faults=WITHOUT_ECHO,
+    ),
+    Bench(
+        name="ros2 gripper",
+        start=ros2.start,
+        backing=scripted.ScriptedGripper,
+        driver="ros2:gripper",
+        is_true=true_width,
+        faults=WITHOUT_ECHO,
     ),
     Bench(
         name="cia402",

@@ -23,9 +23,9 @@ from hal.strict import validate
 class Ros2EmulatorOptions(FaultOptions):
     """`[emulators.NAME.emulator_options]`"""
 
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = Field(default=125.0, description="Rate of the published topics.")
-    port: Annotated[int, Field(ge=0, le=65535)] = Field(default=0, description="0: any free port; rosbridge has 9090.")
-    is_active: bool = Field(default=True, description="Whether the arm's controller is active from the beginning.")
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = Field(default=125.0, description="rate of the published topics")
+    port: Annotated[int, Field(ge=0, le=65535)] = Field(default=0, description="0: any free port; rosbridge has 9090")
+    is_active: bool = Field(default=True, description="whether the arm's controller is active from the beginning")
 
 
 class _Client:

@@ -37,32 +37,32 @@ class Ros2ArmOptions(Ros2Options):
     """Options of `ros2:arm`."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)] = Field(
-        description="Names of the joints in ROS, from the base to the flange, one for each link of `kinematics`."
+        description="names of the joints in ROS, from the base to the flange, one for each link of `kinematics`"
     )
-    kinematics: KinematicsOptions = Field(description="Links and limits of the arm, from its data sheet.")
-    joint_states: Topic = Field(default="/joint_states", description="Topic of the joint_state_broadcaster.")
+    kinematics: KinematicsOptions = Field(description="links and limits of the arm, from its data sheet")
+    joint_states: Topic = Field(default="/joint_states", description="topic of the joint_state_broadcaster")
     command: Literal["trajectory", "positions"] = Field(
         default="trajectory",
-        description="`trajectory` for a joint_trajectory_controller, `positions` for a forward_command_controller.",
+        description="`trajectory` for a joint_trajectory_controller, `positions` for a forward_command_controller",
     )
     command_topic: Topic = Field(
         default="/joint_trajectory_controller/joint_trajectory",
-        description="Topic of the controller: `NAME/joint_trajectory`, or `NAME/commands` with positions.",
+        description="topic of the controller: `NAME/joint_trajectory`, or `NAME/commands` with positions",
     )
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = Field(default=100.0, description="Set-points per second.")
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = Field(default=100.0, description="set-points per second")
     horizon_s: Annotated[float, Field(ge=0.01, le=1)] = Field(
         default=0.05,
-        description="Time until a set-point is reached, and in which an arm without further set-points comes to rest; two to "
-        "five periods of `rate_hz`. It delays the motion by about as much.",
+        description="time until a set-point is reached, and in which an arm without further set-points comes to rest; two to "
+        "five periods of `rate_hz`; it delays the motion by about as much",
     )
     controller: str | None = Field(
         default=None,
-        description="Name of the controller that enabling activates; without it, it must be active already.",
+        description="name of the controller that enabling activates; without it, it must be active already",
     )
     deactivate: tuple[str, ...] = Field(
-        default=(), description="Controllers that enabling deactivates, because they claim the same joints."
+        default=(), description="controllers that enabling deactivates, because they claim the same joints"
     )
-    controller_manager: Topic = Field(default="/controller_manager", description="Node of the controller manager.")
+    controller_manager: Topic = Field(default="/controller_manager", description="node of the controller manager")
 
     def commanded(self) -> tuple[str, ...]:
         """Return the topic of the set-points."""

@@ -22,12 +22,12 @@ class Ros2ForceTorqueOptions(Ros2Options, RangeOptions):
     """Options of `ros2:force_torque`."""
 
     topic: Topic = Field(
-        default="/force_torque_sensor_broadcaster/wrench", description="Topic of the geometry_msgs/WrenchStamped."
+        default="/force_torque_sensor_broadcaster/wrench", description="topic of the geometry_msgs/WrenchStamped"
     )
     sign: Literal[-1, 1] = Field(
-        default=1, description="1 if the topic has the wrench of the environment on the tool, -1 if the opposite."
+        default=1, description="1 if the topic has the wrench of the environment on the tool, -1 if the opposite"
     )
-    rate_hz: Annotated[float, Field(gt=0, le=7000)] = Field(default=100.0, description="Rate of the topic.")
+    rate_hz: Annotated[float, Field(gt=0, le=7000)] = Field(default=100.0, description="rate of the topic")
 
 
 class Ros2ForceTorque(RosbridgeDevice[Wrench]):

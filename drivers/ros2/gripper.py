@@ -26,24 +26,24 @@ MOVING_PART_PER_S = 0.01  # of the stroke
 class Ros2GripperOptions(Ros2Options):
     """Options of `ros2:gripper`."""
 
-    joint: str = Field(description="Name of the gripper's joint in the joint states.")
-    joint_states: Topic = Field(default="/joint_states", description="Topic with the gripper's joint.")
+    joint: str = Field(description="name of the gripper's joint in the joint states")
+    joint_states: Topic = Field(default="/joint_states", description="topic with the gripper's joint")
     action: Topic = Field(
-        default="/gripper_controller/gripper_cmd", description="Name of the action control_msgs/GripperCommand."
+        default="/gripper_controller/gripper_cmd", description="name of the action control_msgs/GripperCommand"
     )
-    open_position: float = Field(default=0.0, description="Joint position when open, in the joint's own unit.")
-    closed_position: float = Field(default=0.8, description="Joint position when closed; 0.8 rad for a 2F-85.")
+    open_position: float = Field(default=0.0, description="joint position when open, in the joint's own unit")
+    closed_position: float = Field(default=0.8, description="joint position when closed; 0.8 rad for a 2F-85")
     stroke_m: Annotated[float, Field(gt=0, le=0.3)] = Field(
-        default=0.085, description="Width between the pads when open."
+        default=0.085, description="width between the pads when open"
     )
-    max_force_n: Annotated[float, Field(gt=0)] = Field(default=60.0, description="Greatest grip force.")
+    max_force_n: Annotated[float, Field(gt=0)] = Field(default=60.0, description="greatest grip force")
     effort_per_n: Annotated[float, Field(gt=0)] = Field(
-        default=1.0, description="`max_effort` of the action for each newton; its unit is the driver's."
+        default=1.0, description="`max_effort` of the action for each newton; its unit is the driver's"
     )
     max_speed_m_per_s: Annotated[float, Field(gt=0)] = Field(
-        default=0.15, description="Speed of the jaws, which the action does not choose."
+        default=0.15, description="speed of the jaws, which the action does not choose"
     )
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = Field(default=50.0, description="Rate of the joint states.")
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = Field(default=50.0, description="rate of the joint states")
 
     def commanded(self) -> tuple[str, ...]:
         """Return the action."""

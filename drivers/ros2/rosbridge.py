@@ -36,10 +36,10 @@ Topic = Annotated[str, Field(min_length=1, pattern=r"^/?[A-Za-z_~{][A-Za-z0-9_/~
 class Ros2Options(TcpOptions):
     """Keys of every device behind rosbridge; each has a connection of its own."""
 
-    host: str = Field(default="127.0.0.1", description="The machine that runs rosbridge_server.")
-    port: PortNumber = Field(default=9090, description="The port of rosbridge_server's WebSocket.")
+    host: str = Field(default="127.0.0.1", description="the machine that runs rosbridge_server")
+    port: PortNumber = Field(default=9090, description="the port of rosbridge_server's WebSocket")
     max_age_s: Annotated[float, Field(gt=0, le=2)] = Field(
-        default=0.1, description="Older messages are not given out; three periods of the topic are usual."
+        default=0.1, description="older messages are not given out; three periods of the topic are usual"
     )
 
     def commanded(self) -> tuple[str, ...]:

@@ -101,6 +101,9 @@ NETWORK: dict[str, dict[str, Any]] = {
     "scip:scanner": {},
     "ur:rtde": {},
     "ur:lights": {"outputs": [0, 1, 2, 3]},
+    "ros2:arm": {"joints": [f"joint_{i}" for i in range(len(ARM["links"]))], "kinematics": ARM},
+    "ros2:gripper": {"joint": "finger_joint"},
+    "ros2:force_torque": {},
 }
 
 

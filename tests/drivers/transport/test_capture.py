@@ -18,6 +18,7 @@ from drivers.emulators import (
     lms200,
     modbus_io,
     netft,
+    ros2,
     rplidar,
     scip,
     scripted,
@@ -46,6 +47,7 @@ SIDES: dict[str, tuple[Callable[..., Any], Callable[[], Any], str, dict[str, Any
     "rplidar": (rplidar.start, scripted.ScriptedScanner, "serial:rplidar", {}),
     "can": (tfmini_i.start_can, scripted.ScriptedProximity, "can:tfmini", {}),
     "servos": (dynamixel.start, scripted.ScriptedArm, "serial:dynamixel", {}),
+    "rosbridge": (ros2.start, scripted.ScriptedForceTorque, "ros2:force_torque", {}),
     "rtde": (ur.start, scripted.ScriptedArm, "ur:rtde", {}),
 }
 WANTED = 20

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
+from benchmarks.drivers.bench import WITHOUT_CRC, Bench
+from benchmarks.drivers.ros2_benches import ROS2_BENCHES
 from benchmarks.drivers.truths import (
     MovingArm,
     TimedForceTorque,
@@ -36,7 +37,6 @@ from drivers.emulators import (
     modbus_io,
     netft,
     robotiq_2f,
-    ros2,
     rplidar,
     scip,
     scripted,
@@ -45,32 +45,8 @@ from drivers.emulators import (
     ur,
     ur_io,
 )
-from drivers.emulators.base import WireEmulator
-from drivers.emulators.faults import WireFault
 from hal.registry import Context, connect
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bench:
-    """Test setup of one device: emulator, driver, options, and a check that a value is one of the latest true ones."""
-
-    name: str
-    start: Callable[[Any, dict[str, Any]], WireEmulator]
-    backing: Callable[[], Any]
-    driver: str
-    is_true: Callable[[Any, Any], bool]
-    options: dict[str, Any] = field(default_factory=dict)
-    far_options: dict[str, Any] = field(default_factory=dict)
-    faults: tuple[WireFault, ...] = tuple(WireFault)
-    taken_s: Callable[[Any, Any], float] | None = None
-    """Returns when a value was taken (monotonic clock); None if the value or the protocol does not reveal it."""
-    stamps: Literal["log", "own log", "taken"] | None = "log"
-    """What time stamps are compared with: the log of sent frames of an emulator in another process or in the driver's,
-    `taken_s`, or nothing (many frames make one value)."""
-
-
-WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
-WITHOUT_ECHO = tuple(f for f in WireFault if f is not WireFault.ECHO)  # of a two-wire line; a WebSocket server has none
 FAST_SCAN = {"scans_per_minute": 2400}
 BENCHES = (
     Bench(
@@ -215,32 +191,7 @@ BENCHES = (
         options={"rate_hz": 125.0},
         stamps="taken",
     ),
-    Bench(
-        name="ros2 arm",
-        start=ros2.start,
-        backing=MovingArm,
-        driver="ros2:arm",
-        taken_s=taken_s,
-        is_true=true_joints,
-        faults=WITHOUT_ECHO,
-    ),
-    Bench(
-        name="ros2 force_torque",
-        start=ros2.start,
-        backing=TimedForceTorque,
-        driver="ros2:force_torque",
-        taken_s=taken_s,
-        is_true=true_wrench,
-        faults=WITHOUT_ECHO,
-    ),
-    Bench(
-        name="ros2 gripper",
-        start=ros2.start,
-        backing=scripted.ScriptedGripper,
-        driver="ros2:gripper",
-        is_true=true_width,
-        faults=WITHOUT_ECHO,
-    ),
+    *ROS2_BENCHES,
     Bench(
         name="cia402",
         start=cia402.start,

@@ -11,7 +11,8 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any
 
-from benchmarks.drivers.benches import BENCHES, Bench, bench, running
+from benchmarks.drivers.bench import Bench
+from benchmarks.drivers.benches import BENCHES, bench, running
 from benchmarks.drivers.report import CLOCK, READ_S, deadline, line
 from drivers.emulators.faults import WireFault
 from hal.errors import CellError

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks.drivers.benches import BENCHES, Bench, bench, running
+from benchmarks.drivers.bench import Bench
+from benchmarks.drivers.benches import BENCHES, bench, running
 from benchmarks.drivers.far_process import far_process
 from benchmarks.drivers.realtime import PRIORITIES, realtime
 from benchmarks.drivers.report import deadline, line

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers.benches import Bench, bench, running
+from benchmarks.drivers.bench import Bench
+from benchmarks.drivers.benches import bench, running
 from benchmarks.drivers.far_process import FarProcess, far_process
 from benchmarks.drivers.realtime import PRIORITIES, realtime
 from benchmarks.drivers.report import deadline, line

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers.benches import BENCHES, Bench
+from benchmarks.drivers.bench import Bench
+from benchmarks.drivers.benches import BENCHES
 from benchmarks.drivers.faults import MIXED, RATES, Cell, Key, matrix
 from benchmarks.drivers.life import unplugging
 from benchmarks.drivers.realtime import REALTIME, realtime

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers.benches import Bench, bench, running
+from benchmarks.drivers.bench import Bench
+from benchmarks.drivers.benches import bench, running
 from benchmarks.drivers.far_process import far_process
 from benchmarks.drivers.report import line
 from hal.arrays import Array

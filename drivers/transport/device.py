@@ -85,9 +85,8 @@ class WireDevice(Generic[T]):
     ) -> None:
         """Publish a new sample to all readers.
 
-        Stamps rise from sample to sample. Where a better estimate of the device's clock would set one back, it is set just
-        after the one before: the sample is younger than that one, so its stamp is closer to the truth than that one's
-        was. A sample that the device took no later than the one before is dropped.
+        Stamps rise. Where a better estimate of the device's clock would set one back, it is set just after the one before,
+        whose error was larger. A sample that the device took no later than the one before is dropped.
 
         Args:
             valid_s: when the value was valid, on the links' clock.

@@ -1,0 +1,33 @@
+"""Test setup of one driver with its emulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from drivers.emulators.base import WireEmulator
+from drivers.emulators.faults import WireFault
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """Test setup of one device: emulator, driver, options, and a check that a value is one of the latest true ones."""
+
+    name: str
+    start: Callable[[Any, dict[str, Any]], WireEmulator]
+    backing: Callable[[], Any]
+    driver: str
+    is_true: Callable[[Any, Any], bool]
+    options: dict[str, Any] = field(default_factory=dict)
+    far_options: dict[str, Any] = field(default_factory=dict)
+    faults: tuple[WireFault, ...] = tuple(WireFault)
+    taken_s: Callable[[Any, Any], float] | None = None
+    """Returns when a value was taken (monotonic clock); None if the value or the protocol does not reveal it."""
+    stamps: Literal["log", "own log", "taken"] | None = "log"
+    """What time stamps are compared with: the log of sent frames of an emulator in another process or in the driver's,
+    `taken_s`, or nothing (many frames make one value)."""
+
+
+WITHOUT_CRC = tuple(f for f in WireFault if f is not WireFault.CRC)
+WITHOUT_ECHO = tuple(f for f in WireFault if f is not WireFault.ECHO)  # of a two-wire line; a WebSocket server has none

@@ -13,6 +13,7 @@ from pydantic import Field
 from drivers.kinds.cameras import LensOptions, nominal, to_pixels
 from drivers.transport.device import PortDevice
 from drivers.transport.link import LinkLost, NoAnswer, now_s
+from drivers.transport.mailbox import IMAGES_RING
 from drivers.transport.options import read_options
 from drivers.transport.port import Port
 from hal.clock import Deadline
@@ -98,6 +99,7 @@ class CameraV4l2(PortDevice[Image]):
     """Live V4L2 camera."""
 
     kind = DeviceKind.CAMERA
+    ring = IMAGES_RING
 
     def __init__(
         self, context: Context, options: CameraV4l2Options, open_grabber: Callable[[], Grabber] | None = None

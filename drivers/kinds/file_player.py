@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from drivers.transport.device import WireDevice
 from drivers.transport.link import now_s
+from drivers.transport.mailbox import IMAGES_RING
 from hal.clock import Deadline
 from hal.readings import Stamped
 from hal.registry import Context
@@ -18,6 +19,8 @@ T = TypeVar("T")
 
 class FilePlayer(WireDevice[T]):
     """Plays files, at most one per period, and waits between them."""
+
+    ring = IMAGES_RING
 
     def __init__(self, context: Context, path: Path, *, rate_hz: float) -> None:
         super().__init__(context, max_age_s=3.0 / rate_hz)

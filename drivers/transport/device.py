@@ -7,21 +7,16 @@ import threading
 from abc import abstractmethod
 from typing import Any, ClassVar, Generic, TypeVar
 
-from drivers.transport.link import LinkLost, RecordingEnded, Refused, now_s
-from drivers.transport.mailbox import Mailbox
+from drivers.transport.link import BYTES_WITHOUT_SENSE, NOT_A_BYTE, LinkLost, RecordingEnded, Refused, now_s
+from drivers.transport.mailbox import RING, Mailbox
 from drivers.transport.port import Port
 from hal.clock import Deadline, PacedClock, WallClock
 from hal.devices import DeviceKind, Health
-from hal.errors import CellError, DeviceFault, DeviceTimeout, DeviceUnavailable
+from hal.errors import CellError, ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 
 T = TypeVar("T")
-NOT_A_BYTE = "no byte has arrived: check power and cable, and that the port leads to this device"
-BYTES_WITHOUT_SENSE = (
-    "bytes arrive, but none of them form a valid answer: the device, its address or, on a serial line, the baud rate is "
-    "not the configured one; `panelwright doctor` finds the baud rate"
-)
 SLICE_S = 0.02  # longest wait of a stream reader, so that close() returns soon
 CONNECT_S = 3.0  # a set-up whose first answers are lost needs several attempts
 REFUSED_S = 1.0  # a port that cannot be opened for this long counts as absent
@@ -45,6 +40,7 @@ class WireDevice(Generic[T]):
     """
 
     kind: ClassVar[DeviceKind]
+    ring: ClassVar[int] = RING  # samples kept for readers that want every one; fewer of images
 
     def __init__(self, context: Context, *, max_age_s: float) -> None:
         self.context = context
@@ -58,7 +54,7 @@ class WireDevice(Generic[T]):
         if self.is_emulated and self.kind is DeviceKind.ARM:
             # While the world runs ahead of the link the arm moves unseen by the tracking guard: 5 mm at 0.25 m/s.
             self.max_age_s = max_age_s / 2.0
-        self.mailbox: Mailbox[T] = Mailbox()
+        self.mailbox: Mailbox[T] = Mailbox(ring=self.ring)
         self.errors = 0
         self._sequence = 0
         self._last_stamps: tuple[float, float | None] = (-math.inf, None)  # of the newest sample: host, device
@@ -154,10 +150,8 @@ class WireDevice(Generic[T]):
     def timeout(self, waited_s: float) -> DeviceTimeout:
         """Return the error for a silent device, with what is known about the silence."""
         self.errors += 1
-        newest = self.mailbox.peek()
-        age = "no good reading so far"
-        if newest is not None:
-            age = f"last good reading {newest.age_s(self.context.clock.now_s()):.2f} s old"
+        newest, now = self.mailbox.peek(), self.context.clock.now_s()
+        age = f"last good reading {newest.age_s(now):.2f} s old" if newest else "no good reading so far"
         return DeviceTimeout(
             f"{self.name} silent for {waited_s:.2f} s; {age}",
             hint="check power and cable; a wrong baud rate or another device on the port looks the same",
@@ -234,9 +228,9 @@ class WireDevice(Generic[T]):
         while now_s() < until_s and self.mailbox.peek() is None:
             try:
                 self.mailbox.wait(oldest_host_s=-math.inf, until_s=until_s)
-            except DeviceUnavailable:
-                if now_s() > started_s + REFUSED_S:
-                    break
+            except (ConfigError, DeviceUnavailable) as refusal:
+                if isinstance(refusal, ConfigError) or now_s() > started_s + REFUSED_S:
+                    break  # no further attempt would succeed
                 threading.Event().wait(SLICE_S)  # another attempt to open the port follows
             except CellError:
                 threading.Event().wait(SLICE_S)

@@ -10,6 +10,11 @@ import time
 from typing import Protocol, runtime_checkable
 
 FLOOD_BYTES = 1 << 20  # more than any buffer between the device and this process holds
+NOT_A_BYTE = "no byte has arrived: check power and cable, and that the port leads to this device"
+BYTES_WITHOUT_SENSE = (
+    "bytes arrive, but none of them form a valid answer: the device, its address or, on a serial line, the baud rate is "
+    "not the configured one; `panelwright doctor` finds the baud rate"
+)
 
 
 class WireError(Exception):

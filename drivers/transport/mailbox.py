@@ -15,6 +15,7 @@ from hal.readings import Stamped
 
 T = TypeVar("T")
 RING = 512  # samples kept for readers that want every sample: 1 s at 500 Hz
+IMAGES_RING = 8  # 512 colour images of 5 megapixels would be 8 GB
 
 
 class Mailbox(Generic[T]):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
+from hal.camera_settings import UNKNOWN, CameraSettings
 from hal.clock import Deadline
 from hal.readings import Cause, Quality, Stamped
 
@@ -183,13 +184,14 @@ class Gripper(Device, Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraCapabilities:
-    """Image size and the manufacturer's nominal intrinsics; the calibration record holds the measured ones."""
+    """Image size, nominal intrinsics (the calibration record holds the measured ones), and the settings in force."""
 
     width_px: int
     height_px: int
     is_colour: bool
     rate_hz: float
     nominal: CameraIntrinsics
+    settings: CameraSettings = UNKNOWN
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 
+from benchmarks.drivers.cameras import part_cameras
 from benchmarks.drivers.canbus import part_can
 from benchmarks.drivers.damaged import part_damaged
 from benchmarks.drivers.faults import part_faults
@@ -36,6 +37,7 @@ PARTS: dict[str, Callable[[float], None]] = {
     "fuzz": part_fuzz,
     "damaged": part_damaged,
     "faults": part_faults,
+    "cameras": part_cameras,
 }
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import cv2
@@ -48,3 +51,15 @@ def to_pixels(bgr: NDArray[Any], *, is_colour: bool) -> Pixels:
         bgr = cv2.cvtColor(bgr, cv2.COLOR_GRAY2BGR)
     code = cv2.COLOR_BGR2RGB if is_colour else cv2.COLOR_BGR2GRAY
     return np.ascontiguousarray(cv2.cvtColor(bgr, code), dtype=np.uint8)
+
+
+def release_in_background(work: Callable[[], object], wait_s: float) -> None:
+    """Run the release of a camera, and wait for it for `wait_s` at most: a library may hang when its camera is gone."""
+
+    def run() -> None:
+        with contextlib.suppress(Exception):  # a camera that is gone cannot be stopped
+            work()
+
+    thread = threading.Thread(target=run, name="release camera", daemon=True)
+    thread.start()
+    thread.join(wait_s)

@@ -1,0 +1,1 @@
+"""RealSense depth cameras, live or from a recording, through librealsense (extra `realsense`)."""

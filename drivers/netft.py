@@ -25,6 +25,7 @@ HEADER, STOP, STREAM = 0x1234, 0, 2
 RECORD = struct.Struct(">III6i")
 FIRST_SEQUENCE = 1
 SEND_S = 0.1
+SLOW = 3.0  # an interval of so many periods by the options is no usual one
 
 
 class NetftOptions(UdpOptions, RangeOptions):
@@ -60,7 +61,7 @@ class Netft(StreamDevice[Wrench]):
         self._last: int | None = None
         self._last_sample = 0
         self._may_be_new = False
-        self._pauses = Pauses()
+        self._pauses = Pauses(longest_s=SLOW / options.rate_hz)
 
     def capabilities(self) -> ForceTorqueCapabilities:
         """Return the capabilities given by the options."""

@@ -125,9 +125,14 @@ class Pauses:
     Data that end a pause may be as old as the pause: neither their arrival nor their content shows it. The same holds for
     data that follow at once, faster than the device measures, until they have made up for the pause. A late reader is no
     pause, because all that it missed comes in one chunk.
+
+    Args:
+        longest_s: longest usual time between two items, of a device whose rate is known; without it, pauses that are
+            frequent enough pass for the usual time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, longest_s: float = math.inf) -> None:
+        self._longest_s = longest_s
         self.reset()
 
     def reset(self) -> None:
@@ -139,7 +144,9 @@ class Pauses:
     @property
     def each_s(self) -> float | None:
         """Return the usual time between two items, or None before the second chunk."""
-        return _median([each_s for _, each_s in self._intervals]) if self._intervals else None
+        if not self._intervals:
+            return None
+        return min(_median([each_s for _, each_s in self._intervals]), self._longest_s)
 
     def may_be_held_up(self, arrived_s: float, count: int) -> bool:
         """Return whether a chunk of `count` items (frames, bytes) may be older than its arrival says."""
@@ -147,7 +154,8 @@ class Pauses:
         self._arrived_s = arrived_s
         if math.isinf(interval_s):
             return False
-        usual_s = _median([usual_s for usual_s, _ in self._intervals]) if self._intervals else math.inf
+        learned_s = _median([usual_s for usual_s, _ in self._intervals]) if self._intervals else math.inf
+        usual_s = min(learned_s, count * self._longest_s)
         measured_s = count * (each_s or 0.0)
         if self._lacking_s > 0.0 and interval_s < AT_ONCE * measured_s:
             self._lacking_s -= measured_s - interval_s

@@ -52,6 +52,18 @@ def test_gaps_are_counted_and_late_and_repeated_records_dropped() -> None:
     assert device.health().errors == 2
 
 
+def test_records_that_are_held_up_again_and_again_are_never_given_as_fresh() -> None:
+    """Every third record is 0.15 s late, and the two after it come at once, so the usual interval cannot be learned."""
+    device, arrived_s, late = lonely(), 0.0, set[int]()
+    for sequence in range(1, 91):
+        is_late = sequence % 3 == 0
+        late |= {sequence} if is_late else set()
+        arrived_s += 0.15 if is_late else 0.0002
+        device.receive(record(sequence, sequence * 1_000_000), arrived_s)
+    samples, _ = device.mailbox.since(0)
+    assert not late & {round(sample.value.force_n[0]) for sample in samples}
+
+
 def test_a_sensor_that_starts_anew_is_followed() -> None:
     device = lonely()
     for sequence in (900, 1, 2, 3):

@@ -145,6 +145,10 @@ class CalibrationRecord(Strict):
     version: Annotated[int, Field(ge=1)] = 1
     date: str
     method: str
+    to_measure: Annotated[
+        tuple[Literal["mount", "intrinsics", "load"], ...],
+        Field(description="parts that nobody has measured yet; a calibration takes its parts off the list"),
+    ] = ()
     mount: MountRecord | None = None
     intrinsics: IntrinsicsRecord | None = None
     load: LoadRecord | None = None

@@ -95,6 +95,10 @@ class WorkspaceSection(Strict):
     angle_tolerance_rad: Positive = 0.27
     park_rad: tuple[float, ...]
     floor_z_m: float = 0.0
+    to_measure: Annotated[
+        tuple[Literal["panel_position_m", "panel_rpy_rad", "park_rad", "floor_z_m"], ...],
+        Field(description="keys of this table that are still guesses"),
+    ] = ()
 
 
 class CellFile(Strict):

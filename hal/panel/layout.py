@@ -119,6 +119,10 @@ class Panel(Strict):
     tags: Annotated[tuple[Tag, ...], AfterValidator(_read_once)] = ()
     objects: tuple[AnyObject, ...] = ()
     tolerances: Tolerances = Tolerances()
+    to_measure: Annotated[
+        tuple[Literal["width_m", "height_m", "thickness_m", "lights", "tags", "objects"], ...],
+        Field(description="keys of this file that are still guesses"),
+    ] = ()
 
     @model_validator(mode="after")
     def _parts_have_their_own_names_and_places(self) -> Panel:

@@ -66,6 +66,7 @@ def renewed(current: CalibrationRecord, found: CalibrationRecord) -> Calibration
     """Return the present record updated with the new results, with its version incremented."""
     parts = {name: getattr(found, name) for name in ("mount", "intrinsics", "load")}
     update = {name: part for name, part in parts.items() if part is not None}
+    update["to_measure"] = tuple(part for part in current.to_measure if part not in update)
     about = {"date": found.date, "method": found.method, "quality": found.quality, "version": current.version + 1}
     return current.model_copy(update=update | about)
 
@@ -77,6 +78,8 @@ def to_toml(record: CalibrationRecord, *, over: str | None = None) -> str:
         over: text of the file that is replaced; its comments are kept.
     """
     data = record.model_dump(mode="json", by_alias=True, exclude_none=True)
+    if not record.to_measure:
+        del data["to_measure"]
     return toml_text(data) if over is None else toml_edited(over, data)
 
 

@@ -19,6 +19,8 @@ from hal.registry import installed_drivers
 from service.client import Client
 from service.commissioning.cell_check import objects_in_reach
 from service.commissioning.preflight import check_machine, check_python, check_simulator
+from service.commissioning.to_measure import to_measure
+from service.knowledge.calibrations import Calibrations
 from service.processes.stop_host import bound_socket
 from service.terminal import console, find_cell
 
@@ -48,11 +50,23 @@ def examine(cell: Path, port: int, *, connect: bool) -> bool:
         ("timer", _timer),
     ]
     results = [_check(name, check) for name, check in checks]
+    if all(results):
+        _list_guesses(cell)
     may_connect = connect and served is None  # two programs must not control one arm
     if may_connect and all(results):  # one broken device hides no other: ports and all devices are examined
         loaded = load_cell(find_cell(cell))
         results += [_wires(loaded), _devices(loaded)]
     return all(results)
+
+
+def _list_guesses(path: Path) -> None:
+    """Print what the files of the cell, and the records measured here, list as not measured."""
+    cell = load_cell(find_cell(path))
+    guesses = tuple(to_measure(Calibrations.of_runs(Path("runs"), cell).applied()))
+    for guess in guesses:
+        console.print(f"[yellow]measure[/] {escape(guess.where):<24} {escape(guess.what)}: {escape(guess.how)}")
+    if guesses:
+        console.print(f"{len(guesses)} values are still guesses; the lists `to_measure` in the files hold them\n")
 
 
 def _check(name: str, check: Callable[[], str]) -> bool:

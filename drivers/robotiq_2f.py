@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from drivers.kinds.grippers import require_finite, require_stroke
 from drivers.transport.link import Refused, now_s
-from drivers.transport.modbus import ModbusMaster
+from drivers.transport.modbus import READ_HOLDING, READ_INPUT_REGISTERS, ModbusMaster
 from drivers.transport.modbus_bus import ModbusDevice, ModbusOptions
 from drivers.transport.options import read_options
 from hal.clock import Deadline
@@ -110,6 +110,7 @@ class Robotiq2F(ModbusDevice[GripperState]):
         self._options = options
         self._goal: int | None = None
         self._force_n = 0.0
+        self._function: int | None = None
 
     def capabilities(self) -> GripperCapabilities:
         """Return the capabilities given by the options."""
@@ -181,6 +182,12 @@ class Robotiq2F(ModbusDevice[GripperState]):
     def _soon(self) -> Deadline:
         return Deadline.after(self.context.clock, 6 * self._options.timeout_s)
 
+    def prepare(self, client: ModbusMaster) -> None:
+        """Read by the other of two functions than before the loss of the bus, so that no late answer fits; move nothing."""
+        if self._function is not None:
+            client.meet(self._options.unit)
+        self._function = READ_INPUT_REGISTERS if self._function == READ_HOLDING else READ_HOLDING
+
     def take_reading(self, client: ModbusMaster) -> None:
         """Read three registers and publish width and grip."""
         status = self._status(client, now_s() + client.attempt_s)
@@ -206,7 +213,10 @@ class Robotiq2F(ModbusDevice[GripperState]):
         )
 
     def _status(self, client: ModbusMaster, until_s: float) -> Status:
-        return decode_status(client.read_registers(unit=self._options.unit, address=INPUT, count=3, until_s=until_s))
+        unit, function = self._options.unit, self._function or READ_HOLDING
+        return decode_status(
+            client.read_registers(unit=unit, address=INPUT, count=3, until_s=until_s, function=function)
+        )
 
     def _require_ready(self, status: Status) -> None:
         if status.state != READY:

@@ -13,17 +13,18 @@ from benchmarks.drivers.damaged import part_damaged
 from benchmarks.drivers.faults import part_faults
 from benchmarks.drivers.fuzz import part_fuzz
 from benchmarks.drivers.life import part_isolation, part_reconnect
+from benchmarks.drivers.modbus import part_modbus
 from benchmarks.drivers.motion import part_csp, part_kill, part_ur
 from benchmarks.drivers.sessions import part_sessions
 from benchmarks.drivers.stamps import part_stamps
 from benchmarks.drivers.swap import part_swap
-from benchmarks.drivers.wire import part_decode, part_latency, part_rtu
+from benchmarks.drivers.wire import part_decode, part_latency
 from hal.gc_freeze import freeze_loaded
 from service.processes.cell import SWITCH_S
 
 PARTS: dict[str, Callable[[float], None]] = {
     "latency": part_latency,
-    "rtu": part_rtu,
+    "modbus": part_modbus,
     "decode": part_decode,
     "can": part_can,
     "stamps": part_stamps,

@@ -29,15 +29,6 @@ def percentiles(samples_s: list[float]) -> tuple[float, float]:
     return 1e6 * statistics.median(ordered), 1e6 * ordered[int(0.99 * len(ordered))]
 
 
-def rate(work: Callable[[], Any], seconds: float) -> float:
-    """Return the calls per second."""
-    count, end_s = 0, time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        work()
-        count += 1
-    return count / seconds
-
-
 def cpu_rate(work: Callable[[], Any], seconds: float) -> float:
     """Return the calls per second of this process's CPU time, as on an idle machine."""
     count, start_s = 0, time.process_time()

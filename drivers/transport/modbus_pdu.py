@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from pymodbus.constants import MoreData
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
@@ -28,7 +29,7 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-REPORT = 0x80  # added to the function of a request that the device refuses
+REFUSALS = tuple(bytes([function | 0x80]) for function in range(0x80))  # first byte of a refusal, by function
 BIT_READS = {1: (ReadCoilsRequest, ReadCoilsResponse), 2: (ReadDiscreteInputsRequest, ReadDiscreteInputsResponse)}
 REGISTER_READS = {
     3: (ReadHoldingRegistersRequest, ReadHoldingRegistersResponse),
@@ -58,15 +59,17 @@ class Question:
     @property
     def forms(self) -> tuple[tuple[bytes, type[ModbusPDU]], ...]:
         """Return how an answer and how a refusal begin, with the class of each."""
-        return (self.head, self.kind), (bytes([self.head[0] | REPORT]), ExceptionResponse)
+        return (self.head, self.kind), (REFUSALS[self.head[0]], ExceptionResponse)
 
 
+@lru_cache(maxsize=256)  # a poll asks the same again and again
 def read_bits(function: int, address: int, count: int) -> Question:
     """Return a request for coils (function 1) or discrete inputs (2)."""
     request, kind = BIT_READS[function]
     return Question(_pdu(request(address=address, count=count)), bytes([function, (count + 7) // 8]), kind)
 
 
+@lru_cache(maxsize=256)
 def read_registers(function: int, address: int, count: int) -> Question:
     """Return a request for holding (function 3) or input (4) registers."""
     request, kind = REGISTER_READS[function]

@@ -6,7 +6,6 @@ A record is a mark, the number of data bytes, the adapter's time stamp (s; 0 wit
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from typing import NamedTuple
 
 from drivers.transport.link import Refused
@@ -36,20 +35,22 @@ def record(frame: CanFrame, stamp_s: float = 0.0) -> bytes:
     return HEAD.pack(MARK, len(frame.data), stamp_s, frame.id) + frame.data
 
 
-def records(chunk: bytes) -> Iterator[tuple[int, bytes, float]]:
-    """Yield identifier, data and the adapter's time stamp of each record.
+def records(chunk: bytes) -> list[tuple[int, bytes, float]]:
+    """Return identifier, data and the adapter's time stamp of each record.
 
     Raises:
         Refused: the bytes are not records.
     """
-    at = 0
-    while at < len(chunk):
-        if chunk[at] != MARK or at + HEAD.size > len(chunk):
+    found, at, end = [], 0, len(chunk)
+    while at < end:
+        if chunk[at] != MARK or at + HEAD.size > end:
             what = "these bytes are not CAN frames; the recording may be one of an older version"
             raise Refused(what, code=chunk[at], hint="make the recording again with this version")
         _, length, stamp_s, id_ = HEAD.unpack_from(chunk, at)
-        at += HEAD.size + length
-        yield id_, chunk[at - length : at], stamp_s
+        data_at = at + HEAD.size
+        at = data_at + length
+        found.append((id_, chunk[data_at:at], stamp_s))
+    return found
 
 
 class FrameReader:
@@ -62,8 +63,10 @@ class FrameReader:
         """Start again, because the link was reopened."""
         self._time.reset()
 
-    def feed(self, chunk: bytes, arrived_s: float) -> Iterator[CanFrame]:
-        """Yield the frames of a chunk that arrived at `arrived_s`; a frame with a time stamp may have arrived earlier."""
-        for id_, data, stamp_s in records(chunk):
-            at_s = self._time.host_s(device_s=stamp_s, arrived_s=arrived_s) if stamp_s else arrived_s
-            yield CanFrame(id_, data, at_s)
+    def feed(self, chunk: bytes, arrived_s: float) -> list[CanFrame]:
+        """Return the frames of a chunk that arrived at `arrived_s`; a frame with a time stamp may have arrived earlier."""
+        host_s = self._time.host_s
+        return [
+            CanFrame(id_, data, host_s(device_s=stamp_s, arrived_s=arrived_s) if stamp_s else arrived_s)
+            for id_, data, stamp_s in records(chunk)
+        ]

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import can
 from pydantic import Field, model_validator
 
-from drivers.transport.can_frames import EXTENDED, LONGEST_CLASSIC, CanFrame, record, records
+from drivers.transport.can_frames import EXTENDED, HEAD, LONGEST_CLASSIC, MARK, records
 from drivers.transport.fd_link import LOOK_UP_S
 from drivers.transport.link import CountingLink, Link, LinkLost, NoAnswer, now_s
 from drivers.transport.options import Captured, opener_with_files
@@ -117,7 +117,7 @@ class CanLink(CountingLink):
         try:
             message = self._first(until_s)
             while message is not None:
-                found.append(_record(message))
+                found.append(_record(message, self._slcan is None or self._slcan.has_clock))
                 message = self._bus.recv(0.0) if len(found) < MOST_AT_ONCE else None
         except LinkLost:
             raise
@@ -164,11 +164,12 @@ class CanLink(CountingLink):
             self._bus.shutdown()
 
 
-def _record(message: can.Message) -> bytes:
-    if message.is_error_frame or message.is_remote_frame or not message.is_rx or message.dlc != len(message.data):
+def _record(message: can.Message, is_stamped: bool) -> bytes:
+    data = message.data
+    if message.is_error_frame or message.is_remote_frame or not message.is_rx or message.dlc != len(data):
         return b""
-    id_ = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-    return record(CanFrame(id_, bytes(message.data)), message.timestamp)
+    id_ = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
+    return HEAD.pack(MARK, len(data), message.timestamp if is_stamped else 0.0, id_) + data
 
 
 def _message(id_: int, data: bytes) -> can.Message:

@@ -7,6 +7,7 @@ with the data that are left, and shares the port with other programs.
 from __future__ import annotations
 
 import time
+from binascii import hexlify, unhexlify
 from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
@@ -32,7 +33,9 @@ ODD_LINES = 3  # so many lines in a row with, or without, a time stamp show that
 TCP = "tcp://"
 FOREVER_S = 1e6
 CLOSING_S = 0.02
-CLASSIC, FD = b"tTrR", b"dDbB"
+LAST_ID, LAST_EXTENDED_ID = 0x7FF, 0x1FFFFFFF
+PLAIN, ZERO = ord("t"), ord("0")
+FD = b"dDbB"
 EXTENDED_KINDS, REMOTE_KINDS, SWITCHED_KINDS = b"TRDB", b"rR", b"bB"
 
 
@@ -74,6 +77,9 @@ class LineReader:
         return [frame for line in lines if line and (frame := self._frame(line)) is not None]
 
     def _frame(self, line: bytes) -> Line | None:
+        if self._is_stamped is False and (frame := plain_frame(line)) is not None:
+            self._odd = 0
+            return frame
         # These letters are no hex digits, so the last of them begins the frame, whatever noise precedes it.
         start = max(line.rfind(b"t"), line.rfind(b"T"), line.rfind(b"r"), line.rfind(b"R"))
         if start < 0 and line[0] not in FD:
@@ -95,6 +101,19 @@ class LineReader:
         return self._odd == 0
 
 
+def plain_frame(line: bytes) -> Line | None:
+    """Return the frame of the usual kind of line (11 bits, data, no time stamp), or None if it must be looked at closely."""
+    if line[0] != PLAIN or len(line) < 5 or not 0 <= (length := line[4] - ZERO) <= LONGEST_CLASSIC:
+        return None
+    if len(line) != 5 + 2 * length:
+        return None
+    try:
+        id_ = int.from_bytes(unhexlify(b"0" + line[1:4]), "big")
+        return Line(PLAIN, id_, length, unhexlify(line[5:])) if id_ <= LAST_ID else None
+    except ValueError:
+        return None
+
+
 def read_line(line: bytes) -> Line:
     """Return the frame that a line holds.
 
@@ -103,15 +122,17 @@ def read_line(line: bytes) -> Line:
     """
     kind = line[0]
     at = 9 if kind in EXTENDED_KINDS else 4
-    id_, code = int(line[1:at], 16), int(line[at : at + 1], 16)
-    if id_ > (0x1FFFFFFF if kind in EXTENDED_KINDS else 0x7FF) or (code > LONGEST_CLASSIC and kind not in FD):
+    # `int` and `bytes.fromhex` would also take spaces, signs and underscores.
+    id_ = int.from_bytes(unhexlify(line[1:at].rjust(8, b"0")), "big")
+    (code,) = unhexlify(b"0" + line[at : at + 1])
+    if id_ > (LAST_EXTENDED_ID if kind in EXTENDED_KINDS else LAST_ID) or (code > LONGEST_CLASSIC and kind not in FD):
         raise ValueError("identifier or length out of range")
     length: int = CAN_FD_DLC[code]
     end = at + 1 + (0 if kind in REMOTE_KINDS else 2 * length)
-    data, rest = bytes.fromhex(line[at + 1 : end].decode("ascii")), line[end:]
+    data, rest = unhexlify(line[at + 1 : end]), line[end:]
     if (kind not in REMOTE_KINDS and len(data) != length) or len(rest) not in (0, STAMP_CHARS):
         raise ValueError("characters lost or added")
-    stamp_ms = int(rest, 16) if rest else None
+    stamp_ms = int.from_bytes(unhexlify(rest), "big") if rest else None
     if stamp_ms is not None and stamp_ms >= STAMP_TURN_MS:
         raise ValueError("time stamp out of range")
     return Line(kind, id_, length, data, stamp_ms)
@@ -129,7 +150,7 @@ def line_of(id_: int, data: bytes, *, remote_length: int | None = None, is_fd: b
     length = len(data) if remote_length is None else remote_length
     code = len2dlc(length) if is_fd else length
     padding = bytes(CAN_FD_DLC[code] - length)
-    digits = (data + padding if is_fd else data).hex().upper().encode()
+    digits = hexlify(data + padding if is_fd else data).upper()
     return b"%s%s%X%s\r" % (kind.upper() if id_ & EXTENDED else kind, number, code, digits)
 
 
@@ -168,6 +189,7 @@ class SlcanBus(can.BusABC):
         self._lines = LineReader()
         self._received: deque[can.Message] = deque()
         self._stamps = _Stamps()
+        self.has_clock = False  # whether frames have the adapter's time stamps; else they have the host's
         self.channel_info = f"slcan {channel}"
         self.link = _opened(channel, tty_baudrate, device)
         rates = b"S%d\r" % RATES[bitrate] + (DATA_RATES[data_bitrate] if fd else b"")
@@ -189,6 +211,9 @@ class SlcanBus(can.BusABC):
         return (self._received.popleft() if self._received else None), False
 
     def _message(self, line: Line, arrived_s: float) -> can.Message:
+        if line.kind == PLAIN and line.stamp_ms is None:
+            return can.Message(arrived_s, line.id, is_extended_id=False, data=line.data)
+        self.has_clock = self.has_clock or line.stamp_ms is not None
         return can.Message(
             timestamp=arrived_s if line.stamp_ms is None else self._stamps.seconds(line.stamp_ms, arrived_s),
             arbitration_id=line.id,
@@ -249,7 +274,7 @@ class _Stamps:
 
 
 def _as_line(message: can.Message) -> bytes:
-    id_ = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+    id_ = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
     if message.is_remote_frame:
         return line_of(id_, b"", remote_length=message.dlc)
     return line_of(id_, bytes(message.data), is_fd=message.is_fd)

@@ -44,6 +44,9 @@ def test_noise_and_a_false_header_before_a_line_cost_nothing() -> None:
         b"t1816270023\r",  # characters lost
         b"t18162700230000\r",  # characters added
         b"t1G12AABB\r",
+        b"t 812AABB\r",
+        b"t1_12AABB\r",
+        b"t181+AABB\r",
         b"t1819AABBCCDDEEFF001122\r",
         b"T181\r",
         b"t\r",

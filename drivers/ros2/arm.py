@@ -37,7 +37,8 @@ class Ros2ArmOptions(Ros2Options):
     """Options of `ros2:arm`."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)] = Field(
-        description="names of the joints in ROS, from the base to the flange, one for each link of `kinematics`"
+        description="names of the joints in ROS, from the base to the flange, one for each link of `kinematics`",
+        examples=[["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]],
     )
     kinematics: KinematicsOptions = Field(description="links and limits of the arm, from its data sheet")
     joint_states: Topic = Field(default="/joint_states", description="topic of the joint_state_broadcaster")

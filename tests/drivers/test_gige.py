@@ -74,6 +74,7 @@ def test_a_setting_that_the_camera_refuses_is_told(far_side: FakeGigeCamera) -> 
     assert "data sheet" in caught.value.hint
 
 
+@pytest.mark.third_party("aravis-tools", "gige:camera")
 def test_numbers_are_whole_and_stamps_even(far_side: FakeGigeCamera) -> None:
     device = gige()
     samples = [device.read_image(deadline=soon()) for _ in range(30)]
@@ -83,6 +84,7 @@ def test_numbers_are_whole_and_stamps_even(far_side: FakeGigeCamera) -> None:
     device.close()
 
 
+@pytest.mark.third_party("aravis-tools", "gige:camera")
 def test_frames_with_lost_packets_are_refused_and_counted() -> None:
     with fake_gige("-r", "20"):
         device = gige(packet_bytes=1400)

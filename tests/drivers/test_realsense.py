@@ -113,6 +113,7 @@ class TestRealsenseColour(CameraContract):
         device.close()
 
 
+@pytest.mark.third_party("pyrealsense2", "realsense:depth")
 def test_depths_are_metres_with_the_recorded_numbers_and_lens(scene: Path) -> None:
     device = connect(Context(name="depth"), "realsense:depth", {"recording": str(scene)})
     c, sample = device.capabilities(), device.read_range(deadline=soon())
@@ -123,6 +124,7 @@ def test_depths_are_metres_with_the_recorded_numbers_and_lens(scene: Path) -> No
     assert np.isnan(sample.value.depth_m[0, :3]).all() and np.isfinite(sample.value.depth_m).sum() == WIDTH * HEIGHT - 3
 
 
+@pytest.mark.third_party("pyrealsense2", "realsense:camera")
 def test_images_carry_the_recorded_numbers_and_the_lens_of_the_camera(scene: Path) -> None:
     device = connect(Context(name="eye"), "realsense:camera", {"recording": str(scene)})
     c, sample = device.capabilities(), device.read_image(deadline=soon())

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from drivers.emulators import ros2
 from drivers.emulators.scripted import ScriptedArm, ScriptedGripper
@@ -81,6 +82,7 @@ def run_client(program: str, *arguments: str) -> str:
     return run.stdout
 
 
+@pytest.mark.third_party("roslibpy", "ros2:arm")
 def test_a_client_of_others_moves_the_emulated_arm_and_switches_its_controller() -> None:
     arm = ScriptedArm()
     before = arm.position_rad.copy()
@@ -93,6 +95,7 @@ def test_a_client_of_others_moves_the_emulated_arm_and_switches_its_controller()
         far_side.close()
 
 
+@pytest.mark.third_party("roslibpy", "ros2:gripper")
 def test_a_client_of_others_closes_the_emulated_gripper_by_the_action() -> None:
     gripper = ScriptedGripper()
     gripper.object_m = 0.03

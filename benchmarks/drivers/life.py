@@ -36,7 +36,7 @@ class Unplugging:
 
 def part_reconnect(seconds: float) -> None:  # noqa: ARG001  # a number of unplugs, however long they take
     """Measure the time from the port's return to the first valid sample, and leaks of descriptors and threads."""
-    for name in ("tfmini", "modbus_io rtu", "scip tcp", "bota"):
+    for name in ("tfmini", "modbus_io rtu", "scip tcp", "bota", "cia402", "tfmini can"):
         found = unplugging(bench(name), UNPLUGS)
         leaked = (found.leaked_descriptors, found.leaked_threads)
         measured = f"{max(found.back_s):.2f} s of {UNPLUGS}; leak {leaked}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,6 +23,7 @@ from hal.wires import ResourceClaim
 SLCAN, SOCKETCAN = "slcan", "socketcan"
 SHARED = ("remote", SOCKETCAN, "socketcand", "udp_multicast", "virtual")  # each device opens the bus for itself
 MOST_AT_ONCE = 512  # frames handed over by one read
+logging.getLogger("can").setLevel(logging.CRITICAL)  # it logs each attempt to open an adapter; we raise what it says
 Plain = str | int | float | bool
 
 
@@ -113,19 +115,23 @@ class CanLink(CountingLink):
 
     def read(self, until_s: float) -> bytes:
         """Return the frames that have arrived: at least one, or `b""` at `until_s`."""
-        found: list[bytes] = []
         try:
-            message = self._first(until_s)
-            while message is not None:
-                found.append(_record(message, self._slcan is None or self._slcan.has_clock))
-                message = self._bus.recv(0.0) if len(found) < MOST_AT_ONCE else None
+            chunk = b""
+            while not chunk and (message := self._first(until_s)) is not None:
+                chunk = self._with_what_waits(message)
         except LinkLost:
             raise
         except Exception as error:  # each adapter's library raises errors of its own
             raise LinkLost(f"{self._name}: {error}") from error
-        chunk = b"".join(found)
         self.received = self.received + len(chunk) if self._slcan is None else self._slcan.link.received
         return chunk
+
+    def _with_what_waits(self, message: can.Message | None) -> bytes:
+        found: list[bytes] = []
+        while message is not None:
+            found.append(_record(message, self._slcan is None or self._slcan.has_clock))
+            message = self._bus.recv(0.0) if len(found) < MOST_AT_ONCE else None
+        return b"".join(found)
 
     def _first(self, until_s: float) -> can.Message | None:
         while not self._is_cancelled:

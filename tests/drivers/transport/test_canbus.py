@@ -144,6 +144,37 @@ def test_a_closing_link_ends_a_waiting_read(link: Any) -> None:
     thread.join()
 
 
+class Scripted(can.BusABC):
+    """Bus that gives out a list of messages, one at a time, with pauses between them."""
+
+    def __init__(self, *messages: can.Message) -> None:
+        self.messages = [item for message in messages for item in (None, message)]
+        super().__init__("scripted")
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        return (self.messages.pop(0) if self.messages else None), False
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        return self._recv_internal(timeout)[0]
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+
+def test_an_error_frame_does_not_end_the_wait_for_an_answer() -> None:
+    answer = can.Message(arbitration_id=3, data=b"x", is_extended_id=False)
+    link = CanLink(Scripted(can.Message(is_error_frame=True), can.Message(is_remote_frame=True), answer), "scripted")
+    assert [frame.data for frame in FrameReader().feed(link.read(later(5.0)), now_s())] == [b"x"]
+    link.close()
+
+
+def test_an_adapter_that_is_away_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    opener, _ = can_opener(options(channel="nocan7"), "finger")
+    with pytest.raises(DeviceUnavailable):
+        opener()
+    assert caplog.records == []
+
+
 class Moody(can.BusABC):
     """Bus whose library raises errors of its own."""
 

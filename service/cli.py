@@ -44,6 +44,7 @@ def _app() -> Callable[[], None]:
     import typer
 
     from service.commands import calibrate, devices, tasks
+    from service.commands.check import check
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
@@ -74,6 +75,7 @@ def _app() -> Callable[[], None]:
     app.command()(replay)
     app.command()(foxglove)
     app.command()(doctor)
+    app.command()(check)
     app.add_typer(devices.app, name="devices")
     app.command()(drivers)
     app.add_typer(tasks.app, name="task")

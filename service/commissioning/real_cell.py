@@ -229,7 +229,7 @@ options = {{ port = "{port}" }}
 mount = {{ parent = "flange", calibration = "wrist_ft" }}
 """
 NO_WRENCH = """\
-# Without a force/torque sensor the cell locates and reads the panel, and touches and operates nothing.
+# No force/torque sensor: locate and read the panel, but run no missions, because nothing limits the force of a touch.
 """
 LIGHTS = """\
 # Four border lights on outputs 0 to 3 of a Modbus I/O, their feedback on inputs 0 to 3, the emergency stop on input 7.

@@ -29,9 +29,9 @@ from perception.calibration import (
     calibration_poses,
     propose_view,
 )
-from perception.vision import viewpoints
-from service.operations.acquisition import OLDEST_S, deadline, look_with_lights, settle
-from service.operations.find_panel import lights_in
+from perception.vision import PanelWay, viewpoints
+from service.operations.acquisition import OLDEST_S, deadline, settle
+from service.operations.find_panel import reference_in_view, reference_points_m, ways_of
 from service.operations.locate import scan_plate
 from service.operations.session import Session
 from service.operations.travel import go_to_first, go_to_joints, kinematics, reachable
@@ -53,8 +53,8 @@ T = TypeVar("T")
 
 
 def camera_stations(session: Session, camera: str, count: int, known: Beforehand) -> list[RigidTransform]:
-    """Return flange poses with all four lights in view; the `count` that are most informative together come first."""
-    start, points_m = _nominal(session, camera), _lights_m(session)
+    """Return flange poses with all reference points in view; the `count` that are most informative together come first."""
+    start, points_m = _nominal(session, camera), reference_points_m(session)
     x, z, lens = start.flange_from_camera, start.base_from_target, start.intrinsics
     nearest_m = viewpoints.overview_distance_m(session.panel, lens, 0.0)
     candidates = calibration_poses.around(
@@ -65,7 +65,7 @@ def camera_stations(session: Session, camera: str, count: int, known: Beforehand
 
 
 def measure_camera(session: Session, camera: str, count: int, known: Beforehand) -> InHandCalibration:
-    """Drive through the stations, look with the lights off and on, and solve for mount, panel and lens.
+    """Drive through the stations, measure the reference points in each view, and solve for mount, panel and lens.
 
     Raises:
         Unreachable: there are too few stations.
@@ -75,21 +75,20 @@ def measure_camera(session: Session, camera: str, count: int, known: Beforehand)
     flanges = camera_stations(session, camera, count, known)
 
     def measure() -> InHandView:
-        pair = look_with_lights(session)
-        lights = lights_in(session, pair)
+        points_px, covariance_px = reference_in_view(session)
         return InHandView(
             base_from_flange=session.mover.state().base_from_flange,
-            pixels_px=lights.points_px,
-            covariance_px=lights.covariance_px,
+            pixels_px=points_px,
+            covariance_px=covariance_px,
         )
 
     views = visit(session, flanges, measure, count=count, name="look")
     session.progress(0.92, "solve")
-    result = calibrate_in_hand(views, _lights_m(session), _nominal(session, camera), known)
+    result = calibrate_in_hand(views, reference_points_m(session), _nominal(session, camera), known)
     _check_scatter(
         result.chi_square,
         result.degrees,
-        "the panel file's light positions, the lens, and whether there are reflections",
+        "the panel file's lights, tags or plate, the lens, and whether there are reflections",
     )
     return result
 
@@ -99,12 +98,8 @@ def _nominal(session: Session, camera: str) -> InHandState:
         flange_from_camera=session.mount(camera).parent_from_child,
         base_from_target=session.believed_panel().parent_from_child,
         intrinsics=session.lens(camera),
-        point_errors_m=np.zeros((len(session.panel.lights), 3)),
+        point_errors_m=np.zeros((len(reference_points_m(session)), 3)),
     )
-
-
-def _lights_m(session: Session) -> Array:
-    return np.array([light.position_m for light in session.panel.lights])
 
 
 def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforehand:
@@ -115,9 +110,11 @@ def beforehand(session: Session, camera: str, *, is_lens_known: bool) -> Beforeh
         stated = (lens.sigma_focal_ratio, lens.sigma_centre_px, lens.sigma_k1)
         ratio, centre, k1 = (max(a, b) for a, b in zip(stated, LEAST_LENS, strict=True))
         known = Beforehand(focal_ratio=ratio, centre_px=centre, k1=k1)
-    point_m = max(session.panel.tolerances.light_m, 1e-5)
-    disc_m = float(np.mean([light.radius_m for light in session.panel.lights]))
-    return replace(known, point_m=point_m, disc_m=disc_m, arm_rad=max(known.arm_rad, arm.resolution_rad))
+    built, way = session.panel.tolerances, ways_of(session)[0]
+    is_discs = way is PanelWay.LIGHTS
+    built_m = built.light_m if is_discs else built.tag_m
+    disc_m = float(np.mean([light.radius_m for light in session.panel.lights])) if is_discs else 0.0
+    return replace(known, point_m=max(built_m, 1e-5), disc_m=disc_m, arm_rad=max(known.arm_rad, arm.resolution_rad))
 
 
 # -- range scanner: the plate from several sides ----------------------------------------------------------------------

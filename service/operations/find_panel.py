@@ -172,6 +172,47 @@ def lights_in(session: Session, pair: LightPair) -> AssignedLights:
     )
 
 
+def reference_points_m(session: Session) -> Array:
+    """Return the points (N, 3) by which a camera is calibrated: the lights, or else the corners of all tags.
+
+    Raises:
+        InvalidRequest: the panel has neither; a plate's outline is not found in views that are turned or oblique.
+    """
+    way = ways_of(session)[0]
+    if way is PanelWay.LIGHTS:
+        return _lights_m(session)
+    if way is PanelWay.TAGS:
+        return np.array([corner for tag in session.panel.tags for corner in tag.corners_m])
+    raise InvalidRequest(
+        "a camera is calibrated by border lights or printed tags, and this panel has neither",
+        hint="print tags, fix them to the plate and write them into the panel file ([[tags]])",
+    )
+
+
+def reference_in_view(session: Session) -> tuple[Array, Array]:
+    """Look, and return the pixels (N, 2) of `reference_points_m` and their covariances (N, 2, 2) by image noise alone.
+
+    Raises:
+        NotFound, Ambiguous: not all of them are visible.
+    """
+    way = ways_of(session)[0]
+    if way is PanelWay.LIGHTS:
+        lights = lights_in(session, look_with_lights(session))
+        return lights.points_px, lights.covariance_px
+    settle(session)
+    taken = look(session)
+    seen = _find(session, taken, way)
+    wanted = reference_points_m(session)
+    order = [int(np.linalg.norm(seen.points_m - point, axis=1).argmin()) for point in wanted]
+    if len(set(order)) < len(wanted) or not np.allclose(seen.points_m[order], wanted):
+        raise NotFound(
+            f"{len(seen.points_m)} of {len(wanted)} points of the panel's {way} are in view",
+            hint="uncover them, or take away from the panel file what is not there",
+        )
+    noise = seen.covariance_px - session.lens_rms_px(taken.camera) ** 2 * np.eye(2)
+    return seen.points_px[order], noise[order]
+
+
 def _find(session: Session, taken: Look, way: PanelWay) -> PanelSighting:
     prior, lens_rms_px = _prior(session, taken), session.lens_rms_px(taken.camera)
     finders: dict[PanelWay, Callable[..., PanelSighting]] = {

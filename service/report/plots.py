@@ -29,7 +29,7 @@ def png_of(pixels: Pixels) -> bytes:
 
 def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any], names: Sequence[str]) -> bytes:
     """Draw the images with lights on and off, and their difference with the four lights circled."""
-    figure = _sheet(3.1)
+    figure = sheet(3.1)
     panes = figure.subplots(1, 3)
     difference = image_on.astype(int) - image_off.astype(int)
     if difference.ndim == 3:
@@ -53,7 +53,7 @@ def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any]
 
 def points_picture(image: Pixels, points_px: NDArray[Any], names: Sequence[str]) -> bytes:
     """Draw an image with the points that show where the panel is."""
-    figure = _sheet(4.6)
+    figure = sheet(4.6)
     pane = figure.subplots()
     pane.imshow(image, cmap="gray", vmin=0, vmax=255)
     pane.set_axis_off()
@@ -65,7 +65,7 @@ def points_picture(image: Pixels, points_px: NDArray[Any], names: Sequence[str])
 
 def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     """Draw the range image and its residuals from the fitted plane."""
-    figure = _sheet(4.2)
+    figure = sheet(4.2)
     left, right = figure.subplots(1, 2)
     shown = left.imshow(depth_m, cmap="viridis")
     left.set_title("range, m", fontsize=9, color=INK)
@@ -82,7 +82,7 @@ def stations_picture(
     panel_from_camera: Sequence[NDArray[Any]], size_m: tuple[float, float], residuals_px: NDArray[Any]
 ) -> bytes:
     """Draw the camera's stations before the plate (4x4 poses `panel_from_camera`) and the residuals in pixels."""
-    figure = _sheet(4.6)
+    figure = sheet(4.6)
     room = figure.add_subplot(1, 2, 1, projection="3d")
     x, y = size_m[0] / 2, size_m[1] / 2
     plate = np.array([[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]])
@@ -117,7 +117,7 @@ def stations_picture(
 
 def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
     """Plot contact force and torque over the whole mission, with the names of the motions that pushed hard."""
-    figure = _sheet(4.2)
+    figure = sheet(4.2)
     force, torque = figure.subplots(2, 1, sharex=True)
     times, wrench = _joined(motions, lambda m: m.log.wrench)
     for k, axis in enumerate("xyz"):
@@ -135,7 +135,7 @@ def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
 
 def joints_picture(motions: Sequence[MotionReport]) -> bytes:
     """Plot the joint angles over the whole mission."""
-    figure = _sheet(3.4)
+    figure = sheet(3.4)
     pane = figure.subplots()
     times, joints = _joined(motions, lambda m: m.log.positions_rad)
     for k in range(joints.shape[1]):
@@ -156,7 +156,7 @@ def _joined(motions: Sequence[MotionReport], pick: Any) -> tuple[NDArray[Any], N
     return times[keep], values[keep]
 
 
-def _sheet(height_in: float) -> Figure:
+def sheet(height_in: float) -> Figure:
     from matplotlib.figure import Figure  # takes half a second to import, so not at the start
 
     return Figure(figsize=(10.5, height_in), dpi=100, layout="constrained")

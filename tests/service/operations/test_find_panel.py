@@ -11,10 +11,10 @@ import pytest
 
 from benchmarks.panel_ways import with_tags
 from hal.config import Cell, load_cell
-from hal.errors import InvalidRequest
+from hal.errors import InvalidRequest, NotFound
 from hal.geometry import difference
 from perception.vision import PanelWay
-from service.operations.find_panel import locate, ways_of
+from service.operations.find_panel import locate, reference_in_view, reference_points_m, ways_of
 from service.operations.locate import go_to_overview, run_panel_pose
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime
@@ -99,3 +99,22 @@ def test_tags_that_the_file_has_elsewhere_contradict_the_outline(context: Operat
     (contradiction,) = found.contradictions
     assert "tags and outline put the panel" in contradiction and "measure it again" in contradiction
     assert task.step == "two ways of finding the panel disagree"
+
+
+def test_a_camera_is_calibrated_by_the_corners_of_all_tags(context: OperationContext) -> None:
+    session = Session(context=context)
+    points_px, covariance_px = reference_in_view(session)
+    assert points_px.shape == (16, 2) and covariance_px.shape == (16, 2, 2)
+    cell = context.connection.cell
+    absent = cell.panel.tags[0].model_copy(update={"id": 40, "position_m": (0.0, 0.197, 0.0)})
+    more = cell.panel.model_copy(update={"tags": (*cell.panel.tags, absent)})
+    none = cell.panel.model_copy(update={"tags": ()})
+    for panel, problem in ((more, NotFound), (none, InvalidRequest)):
+        started = WithCell(context.connection, cell.model_copy(update={"panel": panel}))
+        other = OperationContext(connection=started, task=context.task, runs_dir=context.runs_dir)
+        with pytest.raises(problem):
+            _ = (
+                reference_in_view(Session(context=other))
+                if problem is NotFound
+                else reference_points_m(Session(context=other))
+            )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import cv2
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from drivers.transport.link import LinkLost, NoAnswer, now_s
 from drivers.transport.mailbox import IMAGES_RING
 from drivers.transport.options import read_options
 from drivers.transport.port import Port
+from hal.camera_settings import UNKNOWN, CameraSettings
 from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
 from hal.errors import DeviceUnavailable
@@ -24,6 +26,7 @@ from hal.registry import Context, takes
 from hal.wires import ResourceClaim, WireOptions
 
 GRAB_FAILURES = 3
+OLDEST_S = 2.0  # a stamp farther away is of another clock
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
 
 
@@ -40,8 +43,19 @@ class CameraV4l2Options(LensOptions, WireOptions):
     height_px: Annotated[int, Field(ge=16, le=10_000, description="height of the image that is asked for")] = 480
     rate_hz: Annotated[float, Field(gt=0, le=1000, description="images per second that are asked for")] = 30.0
     is_colour: Annotated[bool, Field(description="whether the images are RGB; else they are grey")] = True
+    pixel_format: Annotated[
+        str | None, Field(pattern="^[A-Z0-9]{4}$", description="how the camera sends pixels, such as `MJPG` or `YUYV`")
+    ] = None
     exposure_s: Annotated[
         Annotated[float, Field(gt=0, le=1)] | None, Field(description="exposure time; automatic exposure if not given")
+    ] = None
+    gain: Annotated[
+        Annotated[float, Field(ge=0)] | None,
+        Field(description="gain in the camera's own steps; not changed if not given"),
+    ] = None
+    white_balance_k: Annotated[
+        Annotated[float, Field(ge=1000, le=20_000)] | None,
+        Field(description="colour temperature of the light, in kelvin; automatic white balance if not given"),
     ] = None
 
     def claims(self) -> tuple[ResourceClaim, ...]:
@@ -50,7 +64,15 @@ class CameraV4l2Options(LensOptions, WireOptions):
 
 
 class Grabber(Protocol):
-    """The part of an OpenCV capture that the driver uses."""
+    """The part of an OpenCV capture that the driver uses; size, rate and settings are those that the camera has taken."""
+
+    size_px: tuple[int, int]
+    rate_hz: float
+    settings: CameraSettings
+
+    def captured_s(self) -> float | None:
+        """Return the stamp that the kernel gave to the last frame, on the links' clock; None if there is none."""
+        ...
 
     def read(self) -> tuple[bool, NDArray[Any]]:
         """Wait for the next frame; return whether it was read, and its pixels."""
@@ -77,13 +99,41 @@ class Capture:
                 hint="another program may hold it, or your user is not in the group `video`",
                 device=name,
             )
+        if options.pixel_format is not None:
+            self._video.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*options.pixel_format))
         self._video.set(cv2.CAP_PROP_FRAME_WIDTH, options.width_px)
         self._video.set(cv2.CAP_PROP_FRAME_HEIGHT, options.height_px)
         self._video.set(cv2.CAP_PROP_FPS, options.rate_hz)
         self._video.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        self._write(options)
+        get = self._video.get
+        self.size_px = (round(get(cv2.CAP_PROP_FRAME_WIDTH)), round(get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        self.rate_hz = get(cv2.CAP_PROP_FPS) or options.rate_hz
+        code = round(get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True)
+        self.settings = CameraSettings(
+            pixel_format=code.decode("ascii", "replace"),
+            exposure_s=None if options.exposure_s is None else self._known(cv2.CAP_PROP_EXPOSURE, EXPOSURE_UNIT_S),
+            gain_db=self._known(cv2.CAP_PROP_GAIN, 1.0),
+        )
+
+    def _write(self, options: CameraV4l2Options) -> None:
         if options.exposure_s is not None:
             self._video.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1)  # manual
             self._video.set(cv2.CAP_PROP_EXPOSURE, options.exposure_s / EXPOSURE_UNIT_S)
+        if options.gain is not None:
+            self._video.set(cv2.CAP_PROP_GAIN, options.gain)
+        if options.white_balance_k is not None:
+            self._video.set(cv2.CAP_PROP_AUTO_WB, 0)
+            self._video.set(cv2.CAP_PROP_WB_TEMPERATURE, options.white_balance_k)
+
+    def _known(self, name: int, unit: float) -> float | None:
+        value = float(self._video.get(name))
+        return value * unit if value > 0.0 else None  # OpenCV gives 0 or -1 for what the camera has not
+
+    def captured_s(self) -> float | None:
+        """Return the kernel's stamp of the last frame, if it is on the monotonic clock, as for all USB cameras."""
+        stamp_s, here_s = 1e-3 * float(self._video.get(cv2.CAP_PROP_POS_MSEC)), now_s()
+        return stamp_s if here_s - OLDEST_S < stamp_s <= here_s else None
 
     def read(self) -> tuple[bool, NDArray[Any]]:
         """Wait for the next frame; return whether it was read, and its pixels."""
@@ -107,30 +157,40 @@ class CameraV4l2(PortDevice[Image]):
         super().__init__(context, max_age_s=3.0 / options.rate_hz)
         self._options = options
         self._failures = 0
+        self._rate_hz = options.rate_hz
+        self._settings = UNKNOWN
         opener = open_grabber or (lambda: Capture(options, context.name))
         self.port: Port[Grabber] = Port(context.name, open_link=opener, tenant=self)
 
     def capabilities(self) -> CameraCapabilities:
-        """Return the requested size and lens; frames of another size are rejected."""
+        """Return the requested size and lens, frames of another size being rejected, and what the camera has taken."""
         o = self._options
         return CameraCapabilities(
             width_px=o.width_px,
             height_px=o.height_px,
             is_colour=o.is_colour,
-            rate_hz=o.rate_hz,
+            rate_hz=self._rate_hz,
             nominal=nominal(o.width_px, o.height_px, o),
+            settings=self._settings,
         )
 
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
         """Return a frame whose exposure began after this call.
 
-        Its stamp is one period before arrival, the earliest possible.
+        Its stamp is the earliest possible: one period before the kernel's stamp, or before arrival if there is none.
         """
         return self.newest(deadline, not_before_s=self.context.clock.now_s())
 
-    def set_up(self, link: Grabber) -> None:  # noqa: ARG002  # there is nothing to configure
-        """Do nothing: the grabber is configured when it is opened."""
+    def set_up(self, link: Grabber) -> None:
+        """Take over what the camera has accepted (owner thread)."""
         self._failures = 0
+        self._rate_hz, self._settings = link.rate_hz, link.settings
+        self._check_size(link.size_px)
+
+    def _check_size(self, size_px: tuple[int, int]) -> None:
+        o = self._options
+        if size_px != (o.width_px, o.height_px):
+            raise NoAnswer(f"the camera delivers {size_px[0]}x{size_px[1]} instead of {o.width_px}x{o.height_px}")
 
     def serve(self, link: Grabber) -> None:
         """Grab and publish one frame."""
@@ -143,13 +203,15 @@ class CameraV4l2(PortDevice[Image]):
                 raise LinkLost(f"{self.link_name()} delivers no more frames")
             return
         self._failures = 0
-        o = self._options
-        if frame.shape[:2] != (o.height_px, o.width_px):
-            raise NoAnswer(
-                f"the camera delivers {frame.shape[1]}x{frame.shape[0]} instead of {o.width_px}x{o.height_px}"
-            )
-        image = Image(pixels=to_pixels(frame, is_colour=o.is_colour), exposure_s=o.exposure_s or 1.0 / o.rate_hz)
-        self.publish(image, valid_s=arrived_s - 1.0 / o.rate_hz)
+        self._check_size((frame.shape[1], frame.shape[0]))
+        captured_s = link.captured_s()
+        stamped_by: Literal["device", "arrival"] = "arrival" if captured_s is None else "device"
+        if stamped_by != self._settings.stamped_by:
+            self._settings = replace(self._settings, stamped_by=stamped_by)
+        period_s = 1.0 / self._rate_hz
+        exposure_s = self._settings.exposure_s or self._options.exposure_s or period_s
+        image = Image(pixels=to_pixels(frame, is_colour=self._options.is_colour), exposure_s=exposure_s)
+        self.publish(image, valid_s=(captured_s or arrived_s) - period_s, device_time_s=captured_s)
 
     def link_name(self) -> str:
         """Return the device's path."""

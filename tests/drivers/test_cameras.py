@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.camera_v4l2 import CameraV4l2, CameraV4l2Options
+from hal.camera_settings import CameraSettings
 from hal.conformance import CameraContract, RangeScannerContract, Rig
 from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable
 from hal.registry import Context, connect
@@ -47,6 +48,14 @@ class TestDepthCamera(RangeScannerContract):
 
 class FakeGrabber:
     """Returns numbered frames until told to fail or to block."""
+
+    size_px = (32, 24)
+    rate_hz = 100.0
+    settings = CameraSettings(pixel_format="MJPG", exposure_s=0.004, gain_db=7.0)
+    stamp_s: float | None = None
+
+    def captured_s(self) -> float | None:
+        return self.stamp_s
 
     def __init__(self) -> None:
         self.frames = 0
@@ -167,6 +176,19 @@ def test_a_live_frame_began_after_the_call() -> None:
     device = v4l2(grabber)
     asked_s = CLOCK.now_s()
     assert device.read_image(deadline=soon()).host_time_s >= asked_s
+    device.close()
+
+
+def test_a_frame_that_lay_in_a_buffer_is_not_given_as_fresh_and_settings_are_reported() -> None:
+    grabber = FakeGrabber()
+    device = v4l2(grabber)
+    assert device.capabilities().settings == CameraSettings(pixel_format="MJPG", exposure_s=0.004, gain_db=7.0)
+    grabber.stamp_s = CLOCK.now_s() - 0.5
+    with pytest.raises(DeviceTimeout):
+        device.read_image(deadline=soon(0.1))
+    assert device.capabilities().settings.stamped_by == "device"
+    grabber.stamp_s = None
+    assert device.read_image(deadline=soon()).value.exposure_s == 0.004
     device.close()
 
 

@@ -166,6 +166,7 @@ def ffmpeg(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
         sender.wait()
 
 
+@pytest.mark.third_party("ffmpeg", "stream:camera")
 def test_mjpeg_of_ffmpeg_is_read_and_a_pause_never_gives_an_old_picture() -> None:
     url = f"http://{ADDRESS}:{free_port()}/video"
     with ffmpeg("-f", "mpjpeg", "-listen", "1", url) as sender:
@@ -183,6 +184,7 @@ def test_mjpeg_of_ffmpeg_is_read_and_a_pause_never_gives_an_old_picture() -> Non
         device.close()
 
 
+@pytest.mark.third_party("ffmpeg", "stream:camera")
 def test_rtsp_of_ffmpeg_is_read_with_the_stamps_of_rtp() -> None:
     url = f"rtsp://{ADDRESS}:{free_port()}/video"
     options = {"url": url, "latency_s": 0.0, "ffmpeg": {"rtsp_flags": "listen", "listen_timeout": "10"}}

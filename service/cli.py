@@ -43,14 +43,13 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import calibrate, devices, tasks
+    from service.commands import calibrate, devices, init, tasks
     from service.commands.check import check
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
     from service.commands.doctor import doctor
     from service.commands.drivers import drivers
     from service.commands.foxglove import foxglove
-    from service.commands.init import init
     from service.commands.journal import journal
     from service.commands.learn import learn
     from service.commands.range import batch, range_image
@@ -68,7 +67,7 @@ def _app() -> Callable[[], None]:
     )
 
     app.callback()(root)
-    app.command()(init)
+    app.add_typer(init.app)  # without a name of its own, so it is one command
     app.command()(serve)
     app.command()(demo)
     app.command()(record)

@@ -30,6 +30,10 @@ QUESTIONS = {
 FIND_BY = ("lights", "tags", "outline")
 
 
+app = typer.Typer()
+
+
+@app.command()
 def init(
     folder: Annotated[Path, typer.Argument(help="Folder for the files; created if missing.")],
     *,

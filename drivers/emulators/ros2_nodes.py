@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from drivers.emulators.base import BACKING_S
+from drivers.emulators.base import BACKING_S, time_of
 from drivers.kinds.arms import kinematics_of
 from drivers.ros2.messages import GRIPPER_COMMAND, JOINT_STATE, JOINT_TRAJECTORY, NANO, POSITIONS, WRENCH_STAMPED
 from hal.arrays import Array
@@ -123,6 +123,7 @@ class ArmNode(BareNode):
         self.trajectories = 0
         self._path: tuple[float, float, Array, Array] | None = None  # begin, duration, from, to
         self._desired: Array | None = None
+        self._device_s = 0.0
 
     def options(self) -> dict[str, Any]:
         """Return the names of the joints, and the kinematics of the backing arm."""
@@ -130,12 +131,13 @@ class ArmNode(BareNode):
 
     def tick(self) -> list[tuple[str, Message]]:
         """Move along the trajectory, or hold its end, and publish the joint states."""
+        sample = self._backing.read_state(deadline=self.deadline())
+        self._device_s, state = time_of(sample), sample.value
         if self.is_active and self._path is not None:
             begun_s, lasts_s, start, goal = self._path
-            part = 1.0 if lasts_s <= 0.0 else min((time.monotonic() - begun_s) / lasts_s, 1.0)
+            part = 1.0 if lasts_s <= 0.0 else min(max((self._device_s - begun_s) / lasts_s, 0.0), 1.0)
             self._desired = start + part * (goal - start)
             self._backing.command_position(self._desired, deadline=self.deadline())
-        state = self._backing.read_state(deadline=self.deadline()).value
         position, velocity = [float(q) for q in state.position_rad], [float(v) for v in state.velocity_rad_per_s]
         return [("/joint_states", joint_state(self.joints, position, velocity, [0.0] * len(self.joints)))]
 
@@ -157,7 +159,7 @@ class ArmNode(BareNode):
         if self._desired is None:
             self._backing.enable(deadline=self.deadline())
             self._desired = self._backing.read_state(deadline=self.deadline()).value.position_rad
-        self._path = (time.monotonic(), lasts_s, self._desired, goal)
+        self._path = (self._device_s, lasts_s, self._desired, goal)
         self.trajectories += 1
 
     def serve(self, service: str, args: Message) -> Message | None:

@@ -18,6 +18,7 @@ WIRED = {
     "wire-ur.toml": "ur10e.toml",
     "wire-cia402.toml": "bench.toml",
     "wire-dynamixel.toml": "bench.toml",
+    "wire-ros2.toml": "ur10e.toml",
 }
 STAND_INS: dict[DeviceKind, Any] = {
     DeviceKind.ARM: scripted.ScriptedArm,

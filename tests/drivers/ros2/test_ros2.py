@@ -32,14 +32,6 @@ class TestRos2Arm(ArmContract):
             yield rig
 
 
-class TestRos2ArmByPositions(ArmContract):
-    @pytest.fixture
-    def rig(self) -> Iterator[Rig[Any]]:
-        options = {"command": "positions", "command_topic": POSITIONS_TOPIC}
-        with wired_rig(emulator.start(ScriptedArm(), {}), ARM, options, sample_period_s=0.1) as rig:
-            yield rig
-
-
 class TestRos2Gripper(GripperContract):
     @pytest.fixture
     def rig(self) -> Iterator[Rig[Any]]:
@@ -72,9 +64,10 @@ def follow(device: Any, arm: ScriptedArm, goal: Any) -> None:
     until(has_arrived)
 
 
-def test_joints_are_mapped_by_name_in_both_directions() -> None:
+@pytest.mark.parametrize("options", [{}, {"command": "positions", "command_topic": POSITIONS_TOPIC}])
+def test_joints_are_mapped_by_name_in_both_directions(options: dict[str, Any]) -> None:
     arm = ScriptedArm()
-    with wired(emulator.start(arm, {}), ARM) as device:
+    with wired(emulator.start(arm, {}), ARM, options) as device:
         np.testing.assert_array_equal(device.read_state(deadline=soon()).value.position_rad, arm.position_rad)
         device.enable(deadline=soon())
         goal = arm.position_rad + np.array([0.01, 0.02, 0.03, -0.01, -0.02, -0.03])
@@ -87,6 +80,7 @@ def test_an_arm_without_further_set_points_stops_at_the_last_one() -> None:
         assert device.capabilities().watchdog_s == 0.2
         device.enable(deadline=soon())
         sent = device.command_position(arm.position_rad + 0.01, deadline=soon())
+        until(lambda: far_side.node.trajectories == 2)
         far_side.unplug(away_s=0.1)  # the host is gone, the controller goes on
         until(lambda: bool(np.allclose(arm.position_rad, sent, atol=1e-9)))
         before = arm.commands

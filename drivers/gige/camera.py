@@ -13,7 +13,7 @@ from drivers.gige.source import FrameSource, GenicamSource, address_of
 from drivers.kinds.cameras import nominal
 from drivers.kinds.pixel_formats import FORMATS, decode
 from drivers.transport.device import SLICE_S, PortDevice
-from drivers.transport.link import NoAnswer, now_s
+from drivers.transport.link import NoAnswer, WireError, now_s
 from drivers.transport.mailbox import IMAGES_RING
 from drivers.transport.options import read_options
 from drivers.transport.port import Port
@@ -21,6 +21,7 @@ from drivers.transport.timebase import HostTime
 from hal.camera_settings import CameraSettings
 from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
+from hal.errors import DeviceUnavailable
 from hal.readings import Stamped
 from hal.registry import Context, takes
 
@@ -199,7 +200,11 @@ class GigeCamera(PortDevice[Image]):
 
     def _open(self) -> FrameSource:
         self._address = self._address or address_of(self._options.camera)
-        return GenicamSource(self._options, self.name, self._address)
+        try:
+            return GenicamSource(self._options, self.name, self._address)
+        except (WireError, DeviceUnavailable):
+            self._address = None  # a camera that is named otherwise may come back with another address
+            raise
 
     def link_name(self) -> str:
         """Return the camera's name and address."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.gige.aravis import library
 from drivers.gige.camera import GigeCamera
 from drivers.gige.frames import Frame
 from drivers.gige.settings import GigeCameraOptions
@@ -110,6 +112,14 @@ def test_a_camera_that_is_not_there_is_named() -> None:
         camera.close()
         with pytest.raises(DeviceUnavailable, match=r"no camera at 127\.0\.0\.1"):
             gige()
+
+
+def test_without_the_library_its_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ctypes.util, "find_library", lambda _name: None)
+    library.cache_clear()
+    with pytest.raises(DeviceUnavailable, match="Aravis") as caught:
+        gige(camera="Vendor-Model-1")
+    assert "libaravis-0.8-0" in caught.value.hint
 
 
 class Script:

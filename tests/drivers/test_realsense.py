@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -154,6 +155,13 @@ def test_a_damaged_recording_is_named(content: bytes, tmp_path: Path) -> None:
 def test_a_camera_that_is_not_connected_is_told_at_once() -> None:
     with pytest.raises(DeviceUnavailable, match="no RealSense camera with serial number 999 is connected"):
         connect(Context(name="eye"), "realsense:depth", {"serial": "999"})
+
+
+def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    with pytest.raises(DeviceUnavailable, match="pyrealsense2") as caught:
+        connect(Context(name="eye"), "realsense:camera", {})
+    assert "panelwright[realsense]" in caught.value.hint
 
 
 class Script:

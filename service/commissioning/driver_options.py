@@ -51,6 +51,7 @@ EXAMPLES: dict[str, Any] = {  # of keys that a cell file must give
     "host": "192.168.1.10",
     "channel": "can0",
     "path": "recordings",
+    "url": "rtsp://192.168.1.20/stream1",
 }
 BY_TYPE: dict[type, Any] = {bool: True, int: 1, float: 1.0, str: "NAME", Path: "FILE"}
 

@@ -80,7 +80,8 @@ def test_a_missing_device_does_not_end_the_service(write_cell: WriteCell, tmp_pa
     served = Served(write_cell(robot=True, options={"finger_proximity": away, "panel_lights": world}), tmp_path)
     try:
         eventually(lambda: "devices connect finger_proximity" in served.log.read_text())
-        assert "no answer from [10.0.0.9]\n  try    plug it in; then" in served.log.read_text()
+        told = served.log.read_text()
+        assert "no answer from [10.0.0.9]\n  lost   panel-pose, recognise" in told and "\n  try    plug it in; then" in told
     finally:
         served.process.terminate()
         served.process.wait(90)

@@ -81,7 +81,10 @@ def test_a_missing_device_does_not_end_the_service(write_cell: WriteCell, tmp_pa
     try:
         eventually(lambda: "devices connect finger_proximity" in served.log.read_text())
         told = served.log.read_text()
-        assert "no answer from [10.0.0.9]\n  lost   panel-pose, recognise" in told and "\n  try    plug it in; then" in told
+        assert (
+            "no answer from [10.0.0.9]\n  lost   panel-pose, recognise" in told
+            and "\n  try    plug it in; then" in told
+        )
     finally:
         served.process.terminate()
         served.process.wait(90)

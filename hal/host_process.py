@@ -29,6 +29,7 @@ class HostProcess:
         make: importable function that makes the objects in the child; raises CellError when it cannot.
         args: its arguments; they are pickled.
         give_up: set it from another thread to end the start, and the child with it.
+        ready_s: how long the start may take.
 
     Raises:
         CellError: what `make` raised.
@@ -42,7 +43,9 @@ class HostProcess:
         *args: Any,
         name: str = "host",
         give_up: threading.Event | None = None,
+        ready_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
+        self._ready_s = ready_s
         self._context = multiprocessing.get_context("spawn")
         self._lifeline, child_end = self._context.Pipe()
         self.address = new_address()
@@ -97,12 +100,12 @@ class HostProcess:
 
     def _first_word(self, name: str, give_up: threading.Event) -> CellError | None:
         """Wait until the child is ready; returns the error with which it failed, or None."""
-        until_s = time.monotonic() + CONNECT_TIMEOUT_S
+        until_s = time.monotonic() + self._ready_s
         while not self._lifeline.poll(LOOK_S):
             if give_up.is_set():
                 return DeviceUnavailable(f"{name} was closed while it started", hint="connect it again", device=name)
             if time.monotonic() > until_s:
-                text = f"the process of {name} was not ready in {CONNECT_TIMEOUT_S:.0f} s"
+                text = f"the process of {name} was not ready in {self._ready_s:.0f} s"
                 return DeviceTimeout(text, hint="the machine may be overloaded; see the log", device=name)
         word: CellError | None = self._lifeline.recv()
         return word

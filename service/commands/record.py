@@ -167,7 +167,8 @@ def show(verdict: Verdict) -> None:
     """Print how a replayed task compares with its recording."""
     answered = f"{verdict.answered} of {verdict.calls} recorded calls"
     if verdict.same_bits:
-        console.print(f"{verdict.verb}: [green]same to the last bit[/]: {answered}, and the result")
+        result = "as far as the recording goes" if verdict.note else "and the result"
+        console.print(f"{verdict.verb}: [green]same to the last bit[/]: {answered}, {result}")
     elif verdict.same_readings:
         console.print(f"{verdict.verb}: [yellow]same readings[/]: {answered}; but not the same result")
     else:

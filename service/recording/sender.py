@@ -13,8 +13,6 @@ from typing import Any
 
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from service.recording.samples import Row
-
 BATCH = 64  # rows; pickling more at once would keep the control loop from the interpreter for longer than 0.1 ms
 PAUSE_S = 0.02
 MOST_ROWS = 50_000  # some 20 s of a control loop in real time; beyond this rows are dropped and counted
@@ -64,8 +62,8 @@ class Sender:
         if not self._is_over:
             self._waiting.append(item)
 
-    def put_row(self, row: Row) -> None:
-        """Record a row of the control loop; it is dropped and counted when too many wait."""
+    def put_row(self, row: tuple[Any, ...]) -> None:
+        """Record a row of the control loop (the fields of a `Row`); it is dropped and counted when too many wait."""
         if self._is_over:
             return
         if len(self._waiting) < MOST_ROWS:

@@ -24,6 +24,7 @@ from service.recording.sender import Note, Sender
 from service.recording.writer import Contents, make_recorder
 
 CELL, PANEL, CALIBRATIONS, KNOWLEDGE = "cell.toml", "panel.toml", "calibrations", "knowledge"
+READY_S = 120.0  # a second on a free machine; a recording is not given up because the machine is busy
 TASK_PROGRESS = "task-progress"
 
 
@@ -80,7 +81,8 @@ class RecordingSession:
             raise ConfigError(
                 f"{path} cannot be written: {error.strerror}", hint="name a file in a folder of yours"
             ) from error
-        process = HostProcess(make_recorder, path.absolute(), _contents(cell, calibrations, inline), name="recorder")
+        contents = _contents(cell, calibrations, inline)
+        process = HostProcess(make_recorder, path.absolute(), contents, name="recorder", ready_s=READY_S)
         endpoint = Endpoint(process.address, bytes(multiprocessing.current_process().authkey).hex())
         return cls(
             path=path, endpoint=endpoint, _process=process, _sender=endpoint.sender(report=lambda _kind, _data: None)

@@ -152,8 +152,8 @@ class Recorder:
 
     def _write(self, item: Any) -> None:
         match item:
-            case Row():
-                self._row(item)
+            case tuple():
+                self._row(Row(*item))
             case Call():
                 self._call(item)
             case Started():

@@ -17,15 +17,18 @@ from hal.motion import GripperMotion, Hold
 from hal.simulated import Fault
 from service.commands.record import show, told
 from service.core import Service
-from service.operations import Operation, OperationContext
+from service.operations import OPERATIONS, Operation, OperationContext
 from service.recording.reader import open_recording
 from service.replay.book import Book, distance, replayed_cell
 from service.replay.verdict import Verdict, differing, replay_tasks
+from service.schema.requests import MissionRequest
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 from tests.service.recording import conftest, looks
 
+ROOT = Path(__file__).resolve().parents[2]
 recorded = conftest.recorded
+looked = conftest.looked
 RecordSession = conftest.RecordSession
 TWO = [("look", {"looks": 2}), ("measure", {}), ("look", {"looks": 1, "to_rad": -0.2})]
 
@@ -78,29 +81,25 @@ def changed(how: Callable[[looks.LookRequest], looks.LookRequest]) -> Mapping[st
     ],
 )
 def test_a_changed_code_path_is_told_with_the_call_that_was_not_recorded(
-    how: dict[str, Any], complaint: str, recorded: RecordSession, replayed: Callable[..., list[Verdict]]
+    how: dict[str, Any], complaint: str, looked: Path, replayed: Callable[..., list[Verdict]]
 ) -> None:
-    path = recorded(tasks=[("look", {"looks": 2})])
-    (verdict,) = replayed(path, changed(lambda request: request.model_copy(update=how)))
+    (verdict,) = replayed(looked, changed(lambda request: request.model_copy(update=how)))
     assert re.search(complaint, verdict.complaint)
     assert "the code path has changed" in verdict.hint
     assert not verdict.same_readings
 
 
 def test_a_motion_that_differs_in_its_last_bits_still_sees_the_same_and_is_told(
-    recorded: RecordSession, replayed: Callable[..., list[Verdict]]
+    looked: Path, replayed: Callable[..., list[Verdict]]
 ) -> None:
-    path = recorded(tasks=[("look", {"looks": 1})])
-    (verdict,) = replayed(path, changed(lambda request: request.model_copy(update={"to_rad": 0.1 + 1e-9})))
+    (verdict,) = replayed(looked, changed(lambda request: request.model_copy(update={"to_rad": 0.1 + 1e-9})))
     assert verdict.same_readings
     assert not verdict.same_bits
     assert "motion 'turn' differs from the recorded one" in verdict.differences[0]
 
 
-def test_fewer_questions_are_told_too(recorded: RecordSession, replayed: Callable[..., list[Verdict]]) -> None:
-    (verdict,) = replayed(
-        recorded(tasks=[("look", {"looks": 2})]), changed(lambda request: request.model_copy(update={"looks": 1}))
-    )
+def test_fewer_questions_are_told_too(looked: Path, replayed: Callable[..., list[Verdict]]) -> None:
+    (verdict,) = replayed(looked, changed(lambda request: request.model_copy(update={"looks": 1})))
     assert (verdict.answered, verdict.calls) == (8, 13)
     assert not verdict.same_readings
 
@@ -119,8 +118,8 @@ def test_recorded_errors_are_raised_again(
     assert verdict.same_bits
 
 
-def test_pages_may_look_at_a_replayed_cell_without_disturbing_it(recorded: RecordSession, tmp_path: Path) -> None:
-    book = Book(open_recording(recorded(tasks=[("look", {"looks": 1})])))
+def test_pages_may_look_at_a_replayed_cell_without_disturbing_it(looked: Path, tmp_path: Path) -> None:
+    book = Book(open_recording(looked))
     cell = book.recording.unpack(tmp_path / "unpacked")
     options = Options(
         port=0, runs_dir=tmp_path / "again", inline=True, warm=False, replay=lambda: replayed_cell(book, cell)
@@ -160,15 +159,54 @@ def test_differences_name_their_place_and_leave_the_run_out() -> None:
 
 
 def test_the_verdict_is_told_in_words(
-    recorded: RecordSession, replayed: Callable[..., list[Verdict]], capsys: pytest.CaptureFixture[str]
+    looked: Path, replayed: Callable[..., list[Verdict]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = recorded(tasks=[("look", {"looks": 2})])
-    assert "cell fake, sim, seed 3" in told(open_recording(path))
+    assert "cell fake, sim, seed 3" in told(open_recording(looked))
     for how in ({}, {"looks": 3}, {"to_rad": 0.1 + 1e-9}):
-        (verdict,) = replayed(path, changed(lambda request, how=how: request.model_copy(update=how)))  # type: ignore[misc]
+        (verdict,) = replayed(looked, changed(lambda request, how=how: request.model_copy(update=how)))  # type: ignore[misc]
         show(verdict)
     text = " ".join(capsys.readouterr().out.split())
     assert "look: same to the last bit: 13 of 13 recorded calls" in text
     assert "look: not the same" in text
     assert "the code path has changed" in text
     assert "look: same readings" in text
+
+
+@pytest.mark.slow
+def test_a_simulated_mission_is_replayed_to_the_last_bit(
+    tmp_path: Path, replayed: Callable[..., list[Verdict]]
+) -> None:
+    path = tmp_path / "mission.mcap"
+    service = Service(
+        load_cell(ROOT / "cells/bench.toml", seed=11), OPERATIONS, runs_dir=tmp_path / "runs", record=path
+    )
+    with conftest.running(service):
+        task = service.submit("missions", MissionRequest(actions=(), touches=3))
+        assert task.wait(250.0)
+        assert task.state == "succeeded"
+    (verdict,) = replayed(path, OPERATIONS)
+    assert (verdict.complaint, verdict.differences) == ("", ())
+    assert verdict.same_bits
+    assert verdict.calls > 40
+
+
+def test_a_recording_without_the_end_of_a_task_is_replayed_as_far_as_it_goes(
+    looked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    book = Book(open_recording(looked))
+    task = book.recording.tasks[0]
+    last = next(k for k, call in enumerate(task.calls) if str(call) == "range_scanner.read_range")
+    task.calls, task.state, task.result = task.calls[:last], None, None
+    book.recording.is_cut = True
+    cell = book.recording.unpack(tmp_path / "cut")
+    service = Service(
+        cell, looks.OPERATIONS, runs_dir=tmp_path / "again", inline=True, replay=lambda: replayed_cell(book, cell)
+    )
+    with conftest.running(service):
+        (verdict,) = replay_tasks(service, book, begin=lambda _task: None)
+    assert verdict.same_bits
+    assert "no end of this task" in verdict.note
+    show(verdict)
+    assert "as far as the recording goes" in " ".join(capsys.readouterr().out.split())
+    assert book.refused is not None
+    assert "cut off" in book.refused.hint

@@ -34,6 +34,16 @@ def run(service: Service, verb: str, **request: Any) -> Any:
     return task
 
 
+@pytest.fixture(scope="module")
+def looked(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of one task that looks twice, for all tests of a module."""
+    path = tmp_path_factory.mktemp("recording") / "session.mcap"
+    cell = load_cell(write_module_cell(robot=True))
+    with running(Service(cell, OPERATIONS, runs_dir=path.parent / "runs", inline=True, record=path)) as service:
+        run(service, "look", looks=2)
+    return path
+
+
 @pytest.fixture
 def recorded(write_cell: WriteCell, tmp_path: Path) -> RecordSession:
     """Return a function that records a session with some tasks, `recorded(inline=..., tasks=[(verb, request)])`."""

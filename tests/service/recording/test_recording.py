@@ -23,13 +23,10 @@ from hal.errors import ConfigError
 from hal.simulated import Fault
 from service.core import Service
 from service.recording.reader import open_recording
-from service.recording.samples import Row
 from service.recording.sender import MOST_ROWS, Dropped, Sender
 from tests.service.conftest import WriteCell
-from tests.service.recording.conftest import RecordSession, run, running
+from tests.service.recording.conftest import run, running
 from tests.service.recording.looks import OPERATIONS
-
-LOOK = ("look", {"looks": 1})
 
 
 def messages(path: Path) -> dict[str, list[Any]]:
@@ -47,14 +44,8 @@ def messages(path: Path) -> dict[str, list[Any]]:
     return found
 
 
-@pytest.fixture
-def session(recorded: RecordSession) -> Path:
-    """Return a recording of one look."""
-    return recorded(tasks=[LOOK])
-
-
-def test_everything_that_was_read_and_commanded_is_in_the_file(session: Path) -> None:
-    found = messages(session)
+def test_everything_that_was_read_and_commanded_is_in_the_file(looked: Path) -> None:
+    found = messages(looked)
     states, targets = found["/control/arm/read_state"], found["/control/arm/command_position"]
     assert len(targets) > 50  # 0.4 s and more at 250 Hz
     assert all(len(one.position_rad) == 6 and one.quality == "valid" for one in states)
@@ -67,8 +58,8 @@ def test_everything_that_was_read_and_commanded_is_in_the_file(session: Path) ->
     assert found["/calls/panel_lights"][0]["arguments"] == [[True, False, True, False]]
 
 
-def test_foxglove_finds_images_joints_frames_and_the_log(session: Path) -> None:
-    found = messages(session)
+def test_foxglove_finds_images_joints_frames_and_the_log(looked: Path) -> None:
+    found = messages(looked)
     image, call = found["/wrist_camera/image"][0], found["/calls/wrist_camera"][0]
     assert call["value"]["value"]["pixels"] == {"$picture": {"topic": "/wrist_camera/image", "sequence": 1}}
     assert np.asarray(PillowImage.open(io.BytesIO(image.data))).shape == (48, 64, 3)
@@ -79,19 +70,19 @@ def test_foxglove_finds_images_joints_frames_and_the_log(session: Path) -> None:
     assert any("look" in line.message and line.name == "task-queued" for line in found["/log"])
 
 
-def test_the_file_says_which_cell_it_is_and_holds_it(session: Path, tmp_path: Path) -> None:
-    recording = open_recording(session)
+def test_the_file_says_which_cell_it_is_and_holds_it(looked: Path, tmp_path: Path) -> None:
+    recording = open_recording(looked)
     assert (recording.about["cell"], recording.about["seed"], recording.about["mode"]) == ("fake", "3", "sim")
     cell = recording.unpack(tmp_path / "unpacked")
     assert (cell.name, cell.file.cell.seed, len(cell.panel.lights)) == ("fake", 3, 4)
     assert cell.path.parent == tmp_path / "unpacked"
     task = recording.tasks[0]
-    assert (task.verb, task.state, task.request["looks"]) == ("look", "succeeded", 1)
+    assert (task.verb, task.state, task.request["looks"]) == ("look", "succeeded", 2)
     assert not recording.is_cut
 
 
-def test_a_recording_that_was_cut_off_is_read_up_to_the_cut(session: Path, tmp_path: Path) -> None:
-    whole, cut = session.read_bytes(), tmp_path / "cut.mcap"
+def test_a_recording_that_was_cut_off_is_read_up_to_the_cut(looked: Path, tmp_path: Path) -> None:
+    whole, cut = looked.read_bytes(), tmp_path / "cut.mcap"
     lengths = []
     for part in (0.999, 0.9, 0.7):
         cut.write_bytes(whole[: int(part * len(whole))])
@@ -163,12 +154,12 @@ def test_a_slow_recorder_costs_readings_which_are_counted_and_nothing_else() -> 
 
     sender = Sender(take, report=lambda _kind, _data: None)
     for k in range(MOST_ROWS + 200):
-        sender.put_row(Row(0, 0.0, 0.0, None, (k,)))
+        sender.put_row((0, 0.0, 0.0, None, (k,)))
     sender.put("a call")
     is_open.set()
     sender.close()
     items = [item for batch in batches for item in pickle.loads(batch)]  # noqa: S301
     lost = sum(item.rows for item in items if isinstance(item, Dropped))
-    assert lost + sum(isinstance(item, Row) for item in items) == MOST_ROWS + 200
+    assert lost + sum(isinstance(item, tuple) for item in items) == MOST_ROWS + 200
     assert 0 < lost <= 200
     assert "a call" in items

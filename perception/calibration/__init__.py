@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from perception.calibration.intrinsics import calibrate_camera
     from perception.calibration.records import record_of, renewed, to_toml
     from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner
+    from perception.calibration.tip import calibrate_tip
     from perception.calibration.wrench import WrenchCalibration, calibrate_wrench
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "calibrate_camera",
     "calibrate_in_hand",
     "calibrate_scanner",
+    "calibrate_tip",
     "calibrate_wrench",
     "propose_view",
     "record_of",

@@ -17,12 +17,14 @@ from service.client import Client
 from service.commands.board import board
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
 from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
+from service.commands.tip import tip
 
 app = typer.Typer(
     help="Calibrate: the arm drives through poses, measures, and stores a versioned, dated record with its quality.",
     no_args_is_help=True,
 )
 app.command()(board)
+app.command()(tip)
 Poses = Annotated[int, typer.Option(min=4, max=40, help="Number of stations to measure from.")]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only plan the stations; nothing moves and nothing is written.")

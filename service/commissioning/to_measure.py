@@ -19,7 +19,7 @@ HOW = {
     (DeviceKind.RANGE_SCANNER, "mount"): "a ruler to 1 cm, then `panelwright calibrate scanner`",
     (DeviceKind.FORCE_TORQUE, "load"): "`panelwright calibrate tool`",
     (DeviceKind.FORCE_TORQUE, "mount"): "the drawing of the adapter: sensor axes in the flange frame",
-    (DeviceKind.GRIPPER, "mount"): "touch one point from four sides (docs/tutorials/first-real-cell.md)",
+    (DeviceKind.GRIPPER, "mount"): "touch one point from four sides, then `panelwright calibrate tip`",
     (DeviceKind.PROXIMITY, "mount"): "a ruler, then the zero against a plate at three distances",
 }
 

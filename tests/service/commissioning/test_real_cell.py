@@ -5,9 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from hal.calibration import load_calibration
@@ -94,16 +92,3 @@ def test_the_files_of_the_tutorial_are_checked(tmp_path: Path, monkeypatch: pyte
             continue
         done = CliRunner().invoke(_app(), [*words, "--port", "0"] if words[0] == "doctor" else words)
         assert done.exit_code == 0, done.output
-
-
-def test_the_tutorial_finds_the_tool_centre_point() -> None:
-    (block,) = [one for one in blocks() if one.page.name == "first-real-cell.md" and one.language == "python"]
-    rng = np.random.default_rng(4)
-    tip, pin = np.array([0.002, -0.001, 0.212]), np.array([0.6, -0.2, 0.1])
-    turns = Rotation.from_euler("xyz", [[3.1, 0, 0], [2.1, 0, 0.5], [3.1, 1.0, 1.5], [2.6, -0.8, 3.0]])
-    places = pin - turns.apply(tip) + rng.normal(scale=2e-4, size=(4, 3))
-    given = {"poses": [[*place, *turn.as_rotvec()] for place, turn in zip(places, turns, strict=True)]}
-    exec(block.code, given)  # noqa: S102 - a block of our own page
-    np.testing.assert_allclose(given["tip_m"], tip, atol=1e-3)
-    np.testing.assert_allclose(given["pin_m"], pin, atol=1e-3)
-    assert float(np.max(given["scatter_m"])) < 1e-3

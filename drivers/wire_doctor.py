@@ -57,7 +57,8 @@ def examine(cell: Cell) -> Iterator[WireFinding]:
     """Examine every serial port and CAN adapter of this machine, then every device of the cell that has its own link."""
     for path in serial_ports():
         yield examine_port(path)
-    yield from can_adapters(uses_can=any(one.driver.startswith("can:") for one in cell.file.devices.values()))
+    wired = [one.driver for name, one in cell.file.devices.items() if name not in cell.file.emulators]
+    yield from can_adapters(uses_can=any(driver.startswith("can:") for driver in wired))
     for name, section in cell.file.devices.items():
         wire = serial_path(section.options)
         if wire is not None and name not in cell.file.emulators:

@@ -15,6 +15,7 @@ from benchmarks.drivers.fuzz import part_fuzz
 from benchmarks.drivers.life import part_isolation, part_reconnect
 from benchmarks.drivers.modbus import part_modbus
 from benchmarks.drivers.motion import part_csp, part_kill, part_ur
+from benchmarks.drivers.peers import part_peers
 from benchmarks.drivers.sessions import part_sessions
 from benchmarks.drivers.stamps import part_stamps
 from benchmarks.drivers.swap import part_swap
@@ -30,6 +31,7 @@ PARTS: dict[str, Callable[[float], None]] = {
     "stamps": part_stamps,
     "reconnect": part_reconnect,
     "sessions": part_sessions,
+    "peers": part_peers,
     "swap": part_swap,
     "isolation": part_isolation,
     "ur": part_ur,

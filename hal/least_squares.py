@@ -2,10 +2,9 @@
 
 Residuals are whitened by their covariance, so that the sum is a chi-square and the inverse of J^T J is a covariance.
 
-`descend` minimises any residuals. The loops that run thousands of times per second are compiled together with their
-residuals: those of `fusion.solve.descent`, `perception.vision.quadrangle` and `perception.range.fitting`. They differ in
-how they linearise and move, and share the rule of the damping, `next_damping`; the first two also share the step,
-`solve_damped`.
+`minimise` is the only such loop of the project. `descend` runs it in Python for any residuals. Problems that are solved
+thousands of times per second (`fusion.solve.descent`, `perception.vision.quadrangle`, `perception.range.fitting`) run it
+compiled together with their residuals: numba copies it into a compiled function that calls it.
 
 Source: D. W. Marquardt, J. SIAM 11(2), 1963: the damping is scaled by the diagonal of J^T J, falls after a step that
 reduces the sum, and rises after one that does not.
@@ -15,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,30 +23,37 @@ from hal.errors import NotObservable
 from hal.jit import inlined
 from hal.small_algebra import factor, solve_lower, solve_upper
 
+P = TypeVar("P")
 S = TypeVar("S")
+T = TypeVar("T")
 
 STEPS = 60
-CONVERGED = 1e-10  # decrease of chi-square in one step, relative to 1 + chi-square
+CONVERGED = 1e-10  # expected decrease of chi-square in one step, relative to 1 + chi-square
 
 
 class DampingRule(NamedTuple):
     """How the damping follows from whether a step has reduced the sum of squares.
 
     Attributes:
+        start: damping of the first step.
         fall, rise: factors after a step that reduces the sum, and after one that does not.
         least: it does not fall below this.
         restart: it rises at least to this.
         most: the descent ends above this.
+        stuck: the descent also ends after a step that does not reduce the sum and whose expected gain was below this
+            multiple of the negligible one.
     """
 
+    start: float
     fall: float
     rise: float
     least: float
     restart: float
     most: float
+    stuck: float = 1.0
 
 
-RULE = DampingRule(fall=0.1, rise=10.0, least=1e-12, restart=0.0, most=1e8)
+RULE = DampingRule(start=1e-6, fall=0.1, rise=10.0, least=1e-12, restart=0.0, most=1e8)
 
 
 @inlined
@@ -56,6 +62,56 @@ def next_damping(damping: float, is_lower: bool, rule: DampingRule) -> float:
     if is_lower:
         return max(damping * rule.fall, rule.least)
     return max(damping * rule.rise, rule.restart)
+
+
+@inlined(early=True)
+def minimise(
+    solve: Callable[[P, S, float], float], move: Callable[[P, S, S], None], evaluate: Callable[[P, S, bool], float],
+    accept: Callable[[P, S, S, bool], None], problem: P, at: S, trial: S, cost: float,
+    rule: DampingRule, steps: int, negligible: float,
+) -> tuple[float, bool]:  # fmt: skip
+    """Reduce a sum of squares by at most `steps` damped steps, which move the point `at`.
+
+    A point holds a state, the linear system there and the step from there.
+
+    Args:
+        solve: writes the step that the given damping allows into the point and returns its expected gain, in any measure;
+            -1 where there is no step.
+        move: writes the state after the step of the first point into the second.
+        evaluate: returns the sum of squares at a point. It may write the linear system there.
+        accept: copies the second point into the first, which then needs the linear system. For both, the last argument
+            tells that no step follows, so that the system may be left out.
+        problem: data that the three functions need.
+        at: the start, evaluated; afterwards the point with the smallest sum. `trial`: storage for a second point.
+        cost: sum of squares at the start.
+        negligible: the descent ends with a step whose expected gain is below this.
+
+    Returns:
+        the smallest sum, and whether it is that of the point that was evaluated last.
+    """
+    damping, is_lower = rule.start, True
+    for turn in range(steps):
+        gain = solve(problem, at, damping)
+        if gain < 0.0:
+            damping = next_damping(damping, False, rule)
+            if damping > rule.most:
+                break
+            continue
+        move(problem, at, trial)
+        is_last = turn + 1 == steps or gain < negligible
+        trial_cost = evaluate(problem, trial, is_last)
+        is_lower = trial_cost <= cost
+        if is_lower:
+            accept(problem, at, trial, is_last)
+            cost = trial_cost
+            if is_last:
+                break
+        elif gain < rule.stuck * negligible:
+            break
+        damping = next_damping(damping, is_lower, rule)
+        if damping > rule.most:
+            break
+    return cost, is_lower
 
 
 @inlined
@@ -84,9 +140,17 @@ class Minimum:
     covariance: Array
 
 
+class _Point(Generic[T]):
+    """State, whitened residual, Jacobian, and the step from there."""
+
+    def __init__(self, state: T) -> None:
+        self.state = state
+        self.residual = self.jacobian = self.step = np.empty(0)
+
+
 def descend(
-    state: S, linearise: Callable[[S], tuple[Array, Array]], move: Callable[[S, Array], S]
-) -> tuple[S, Minimum]:
+    state: T, linearise: Callable[[T], tuple[Array, Array]], move: Callable[[T, Array], T]
+) -> tuple[T, Minimum]:
     """Return the state that minimises |residual|^2, with chi-square and covariance there.
 
     Args:
@@ -97,29 +161,29 @@ def descend(
     Raises:
         NotObservable: the residuals do not depend on some direction of the state.
     """
-    residual, jacobian = linearise(state)
-    damping = 1e-6
-    for _ in range(STEPS):
-        information, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+
+    def evaluate(_: None, point: _Point[T], is_last: bool) -> float:  # noqa: ARG001  # the system gives the covariance
+        point.residual, point.jacobian = linearise(point.state)
+        return float(point.residual @ point.residual)
+
+    def solve(_: None, point: _Point[T], damping: float) -> float:
+        information, gradient = point.jacobian.T @ point.jacobian, point.jacobian.T @ point.residual
         scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
         scaled = information / np.outer(scale, scale) + damping * np.eye(len(scale))
-        step = -np.linalg.lstsq(scaled, gradient / scale, rcond=None)[0] / scale
-        candidate = move(state, step)
-        new_residual, new_jacobian = linearise(candidate)
-        if new_residual @ new_residual <= residual @ residual:
-            fall = float(residual @ residual - new_residual @ new_residual)
-            state, residual, jacobian = candidate, new_residual, new_jacobian
-            damping = next_damping(damping, True, RULE)
-            if fall < CONVERGED * (1.0 + float(residual @ residual)):
-                break
-        else:
-            damping = next_damping(damping, False, RULE)
-            if damping > RULE.most:
-                break
-    information = jacobian.T @ jacobian
-    return state, Minimum(
-        chi_square=float(residual @ residual), information=information, covariance=invert(information)
-    )
+        point.step = -np.linalg.lstsq(scaled, gradient / scale, rcond=None)[0] / scale
+        return max(float(-gradient @ point.step), 0.0) / (1.0 + float(point.residual @ point.residual))
+
+    def write_moved(_: None, point: _Point[T], into: _Point[T]) -> None:
+        into.state = move(point.state, point.step)
+
+    def accept(_: None, at: _Point[T], trial: _Point[T], is_last: bool) -> None:  # noqa: ARG001  # copying is cheap
+        at.state, at.residual, at.jacobian = trial.state, trial.residual, trial.jacobian
+
+    at = _Point(state)
+    cost = evaluate(None, at, False)
+    cost, _ = minimise(solve, write_moved, evaluate, accept, None, at, _Point(state), cost, RULE, STEPS, CONVERGED)
+    information = at.jacobian.T @ at.jacobian
+    return at.state, Minimum(chi_square=cost, information=information, covariance=invert(information))
 
 
 def invert(information: Array) -> Array:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fusion.batch import Batch
 from fusion.distance.rows import rows, whitened
 from fusion.vectors import cholesky, move
 from hal.arrays import Array
-from hal.jit import compiled
-from hal.least_squares import DampingRule, next_damping, solve_damped
+from hal.jit import compiled, inlined
+from hal.least_squares import DampingRule, minimise, solve_damped
 from hal.small_algebra import put1, put2, solve_lower
 
-RULE = DampingRule(fall=0.1, rise=8.0, least=1e-9, restart=1e-6, most=1e8)
+RULE = DampingRule(start=1e-6, fall=0.1, rise=8.0, least=1e-9, restart=1e-6, most=1e8)
+FAR_RULE = RULE._replace(start=1e-3)
 FLOOR = 1e-12  # of the information, relative to its largest entry, because measurements may leave a motion free
 
 
@@ -59,6 +62,66 @@ def cost_of(b: Batch, use: Array, R: Array, t: Array, far: bool, work: Array) ->
     return cost
 
 
+class Problem(NamedTuple):
+    """Measurements, which of them to use (N,), whether the pose may be far from them, and scratch."""
+
+    b: Batch
+    use: Array
+    far: bool
+    L: Array
+    work: Array
+
+
+class Point(NamedTuple):
+    """Pose R (3, 3), t (3,); information H (6, 6), lower, gradient g (6,) and step (6,) there."""
+
+    R: Array
+    t: Array
+    H: Array
+    g: Array
+    step: Array
+
+
+@inlined
+def solve(problem: Problem, at: Point, damping: float) -> float:
+    """Write the damped step into `at` and return the predicted decrease; -1 where there is no step."""
+    size = 0.0
+    for j in range(6):
+        size = max(size, at.H[j, j])
+        at.step[j] = -at.g[j]
+    fall = solve_damped(at.H, at.H, damping, FLOOR * size, 0.0, at.step, problem.L, 6)
+    turn = at.step[3] ** 2 + at.step[4] ** 2 + at.step[5] ** 2
+    if fall >= 0.0 and turn > 1.0:  # the linearisation is not valid beyond a radian
+        for j in range(6):
+            at.step[j] /= turn**0.5
+    return fall
+
+
+@inlined
+def move_into(problem: Problem, at: Point, trial: Point) -> None:  # noqa: ARG001  # `minimise` passes it
+    """Write the pose after the step of `at` into `trial`."""
+    put1(trial.t, at.t)
+    put2(trial.R, at.R)
+    move(trial.R, trial.t, at.step)
+
+
+@inlined
+def evaluate(problem: Problem, at: Point, is_last: bool) -> float:
+    """Return the cost at a pose and write its information and gradient, which nobody needs after the last step."""
+    if is_last:
+        return cost_of(problem.b, problem.use, at.R, at.t, problem.far, problem.work)
+    return accumulate(problem.b, problem.use, at.R, at.t, problem.far, at.H, at.g, problem.work)
+
+
+@inlined
+def accept(problem: Problem, at: Point, trial: Point, is_last: bool) -> None:  # noqa: ARG001  # copying is cheap
+    """Copy `trial` into `at`."""
+    put2(at.R, trial.R)
+    put1(at.t, trial.t)
+    put2(at.H, trial.H)
+    put1(at.g, trial.g)
+
+
 @compiled
 def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tolerance: float) -> float:
     """Minimise sum |r|^2 over entries with use > 0 by Levenberg-Marquardt, moving R, t in place; returns the cost.
@@ -66,39 +129,10 @@ def descend(b: Batch, use: Array, R: Array, t: Array, far: bool, steps: int, tol
     The step is damped in proportion to the diagonal of J^T J (Marquardt), so metres and radians need no common scale.
     It stops when the predicted decrease is below `tolerance`.
     """
-    H, L, g, step = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
-    H1, g1, work = np.empty((6, 6)), np.empty(6), np.empty((13, 6))
-    R1, t1 = np.empty((3, 3)), np.empty(3)
-    damping, swapped = (1e-3 if far else 1e-6), False
-    cost = accumulate(b, use, R, t, far, H, g, work)
-    for _ in range(steps):
-        size = 0.0
-        for j in range(6):
-            size = max(size, H[j, j])
-            step[j] = -g[j]
-        fall = solve_damped(H, H, damping, FLOOR * size, 0.0, step, L, 6)
-        if fall < 0.0:
-            damping = next_damping(damping, False, RULE)
-            continue
-        turn = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
-        if turn > 1.0:  # the linearisation is not valid beyond a radian
-            for j in range(6):
-                step[j] /= turn**0.5
-        put1(t1, t)
-        put2(R1, R)
-        move(R1, t1, step)
-        # Most steps are taken, so the next system is built at once instead of the cost alone.
-        lower = accumulate(b, use, R1, t1, far, H1, g1, work)
-        is_lower = lower < cost
-        if is_lower:
-            R, R1, t, t1 = R1, R, t1, t
-            H, H1, g, g1 = H1, H, g1, g
-            swapped = not swapped
-            cost = lower
-        damping = next_damping(damping, is_lower, RULE)
-        if fall < tolerance or damping > RULE.most:
-            break
-    if swapped:  # R1 and t1 are the arguments
-        put2(R1, R)
-        put1(t1, t)
+    problem = Problem(b, use, far, np.empty((6, 6)), np.empty((13, 6)))
+    at = Point(R, t, np.empty((6, 6)), np.empty(6), np.empty(6))
+    trial = Point(np.empty((3, 3)), np.empty(3), np.empty((6, 6)), np.empty(6), np.empty(6))
+    cost = evaluate(problem, at, False)
+    rule = FAR_RULE if far else RULE
+    cost, _ = minimise(solve, move_into, evaluate, accept, problem, at, trial, cost, rule, steps, tolerance)
     return cost

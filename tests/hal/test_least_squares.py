@@ -60,7 +60,7 @@ def test_there_is_no_step_where_the_matrix_is_not_positive_definite() -> None:
 
 
 def test_the_damping_falls_to_its_least_value_and_rises_at_once_to_where_it_matters() -> None:
-    rule = DampingRule(fall=0.1, rise=8.0, least=1e-9, restart=1e-6, most=1e8)
+    rule = DampingRule(start=1e-4, fall=0.1, rise=8.0, least=1e-9, restart=1e-6, most=1e8)
     assert next_damping(1e-3, True, rule) == pytest.approx(1e-4)
     assert next_damping(1e-9, True, rule) == 1e-9
     assert next_damping(1e-9, False, rule) == 1e-6

@@ -23,7 +23,7 @@ from perception.range.fitting.initialisation import (
     start_sphere,
 )
 from perception.range.fitting.rays import CHUNK, ERROR, FILLED, LOADED, NOTHING, fill_rows, load_rows
-from perception.range.fitting.refine import new_scratch, refine
+from perception.range.fitting.refine import Scratch, new_scratch, refine
 from perception.range.fitting.surfaces import (
     CONE,
     CYLINDER,
@@ -63,15 +63,15 @@ def _load(x: Array, y: Array, z: Array, sigma: Array, work: Array) -> int:
 @compiled
 def _fill_errors(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool,
-    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array], held: int,
+    scratch: Scratch, held: int,
 ) -> int:  # fmt: skip
     """Compute the residuals (N,) in sigmas; returns which rows of `scratch` are valid afterwards.
 
-    They go into row ERROR if `scratch` holds the samples, and otherwise into its last array.
+    They go into row ERROR if `scratch` holds the samples, and otherwise into `errors`.
     """
-    work, frame, n = scratch[0], scratch[7], x.shape[0]
+    work, frame, n = scratch.work, scratch.trial.frame, x.shape[0]
     if held == NOTHING:
-        residuals_by_chunks(kind, th, x, y, z, sigma, perspective, frame, work, scratch[10])
+        residuals_by_chunks(kind, th, x, y, z, sigma, perspective, frame, work, scratch.errors)
     elif held == LOADED:
         frame_of(kind, th, frame)
         fill_rows(kind, th, frame, n, perspective, work)
@@ -124,15 +124,15 @@ def fit_robust(
 @compiled
 def _robust(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask, rounds: int,
-    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array],
+    scratch: Scratch,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Fit as `fit_robust`, but update `th` in place.
 
     Returns the mean squared residual of the kept samples, the share kept, and the trimmed cost.
     """
     n = x.shape[0]
-    e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
-    held, is_last, before, cost, used = _load(x, y, z, sigma, scratch[0]), rounds == 0, np.inf, 0.0, 0
+    e = scratch.work[ERROR : ERROR + n] if n <= CHUNK else scratch.errors[:n]
+    held, is_last, before, cost, used = _load(x, y, z, sigma, scratch.work), rounds == 0, np.inf, 0.0, 0
     for turn in range(rounds + 1):
         scale, steps = 0.0, 3
         if not is_last:
@@ -154,12 +154,12 @@ def _robust(
 @compiled
 def _rough(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask,
-    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array],
+    scratch: Scratch,
 ) -> float:  # fmt: skip
     """Update `th` by a few robust steps; returns the sum of squared residuals, each capped at `ROUGH_LIMIT` squared."""
     n = x.shape[0]
-    e = scratch[0][ERROR : ERROR + n] if n <= CHUNK else scratch[10][:n]
-    held, steps = _load(x, y, z, sigma, scratch[0]), ROUGH_STEPS
+    e = scratch.work[ERROR : ERROR + n] if n <= CHUNK else scratch.errors[:n]
+    held, steps = _load(x, y, z, sigma, scratch.work), ROUGH_STEPS
     held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
     for _ in range(2):
         scale = middle_scale(e)

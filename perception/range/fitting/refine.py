@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from hal.arrays import Array, Mask
-from hal.jit import compiled
-from hal.least_squares import DampingRule, next_damping
-from hal.small_algebra import solve_positive
+from hal.arrays import Array, Labels, Mask
+from hal.jit import compiled, inlined
+from hal.least_squares import DampingRule, minimise
+from hal.small_algebra import put1, solve_positive
 from perception.range.fitting.equations import normal_equations
 from perception.range.fitting.rays import ERRED, LOADED, SCRATCH
 from perception.range.fitting.surfaces import (
@@ -20,32 +22,70 @@ from perception.range.fitting.surfaces import (
     step_into,
 )
 
-# Slower than elsewhere, because a fit takes few steps and the weights change with the residuals.
-RULE = DampingRule(fall=0.2, rise=10.0, least=1e-9, restart=0.0, most=1e6)
+# The damping falls slower than elsewhere, because a fit takes few steps and the weights change with the residuals.
+RULE = DampingRule(start=1e-4, fall=0.2, rise=10.0, least=1e-9, restart=0.0, most=1e6, stuck=1.0 / 30.0)
 FLOOR = 1e-12  # of the Gauss-Newton matrix
-STEP_GOAL = 1e-3  # in standard deviations of each parameter: smaller steps are negligible
+STEP_GOAL = 0.03  # in standard deviations of each parameter: a smaller step is the last one
+
+
+class Point(NamedTuple):
+    """Parameters of a surface and what belongs to them.
+
+    These are the parameters `th`, their tangent `frame`, the Gauss-Newton matrix `H` (9, 9) and gradient `g` (9,), the
+    `step` from there (9,), and the number of samples `used` (1,).
+    """
+
+    th: Array
+    frame: Array
+    H: Array
+    g: Array
+    step: Array
+    used: Labels
+
+
+class Scratch(NamedTuple):
+    """Work arrays of a fit: the rows of `rays`, a factor (9, 9), two points, and residuals of many samples."""
+
+    work: Array
+    A: Array
+    at: Point
+    trial: Point
+    errors: Array
+
+
+class Problem(NamedTuple):
+    """Samples, weights and scratch of one descent; see `refine`."""
+
+    kind: int
+    x: Array
+    y: Array
+    z: Array
+    sigma: Array
+    perspective: bool
+    scale: float
+    trim: float
+    fixed: Mask
+    held: int
+    work: Array
+    A: Array
 
 
 @compiled
-def new_scratch(samples: int) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
-    """Allocate the work arrays of a fit to at most `samples` samples.
-
-    In this order: the rows of `rays`; matrix (9, 9) and gradient (9,) of the current parameters, and of the trial
-    parameters; matrix and vector of a step; tangent frames of the current and of the trial parameters; trial
-    parameters; residuals.
-    """
-    small = np.empty(3 * 81 + 3 * 9 + 2 * 6 + SIZE)  # one allocation instead of nine
+def new_scratch(samples: int) -> Scratch:
+    """Allocate the work arrays of a fit to at most `samples` samples."""
+    small = np.empty(3 * 81 + 4 * 9 + 2 * 6 + 2 * SIZE)  # one allocation instead of many
     H, H2, A = small[:81].reshape((9, 9)), small[81:162].reshape((9, 9)), small[162:243].reshape((9, 9))
-    g, g2, step = small[243:252], small[252:261], small[261:270]
-    frame, new_frame, trial = small[270:276], small[276:282], small[282:]
-    return np.empty(SCRATCH), H, g, H2, g2, A, step, frame, new_frame, trial, np.empty(samples)
+    g, g2, step, step2 = small[243:252], small[252:261], small[261:270], small[270:279]
+    frame, frame2, th, th2 = small[279:285], small[285:291], small[291 : 291 + SIZE], small[291 + SIZE :]
+    used: Labels = np.zeros(2, np.int32)
+    at, trial = Point(th, frame, H, g, step, used[:1]), Point(th2, frame2, H2, g2, step2, used[1:])
+    return Scratch(np.empty(SCRATCH), A, at, trial, np.empty(samples))
 
 
 @compiled
 def refine(
     kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, steps: int, scale: float,
-    trim: float, fixed: Mask,
-    scratch: tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array], held: int,
+    trim: float, fixed: Mask, scratch: Scratch, held: int,
 ) -> tuple[float, int, int]:  # fmt: skip
     """Minimise the ray residuals with at most `steps` damped Gauss-Newton steps; updates the parameters `th` in place.
 
@@ -53,53 +93,67 @@ def refine(
         x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
         scale: > 0: width of the Cauchy weights in sigmas; 0: trim at `trim` and plain least squares.
         fixed: (9,) bool, tangent parameters that stay at their prior value.
-        scratch: work arrays of `new_scratch`.
         held: which rows for these samples and `th` are valid in `scratch` (NOTHING, LOADED, ERRED or FILLED).
 
     Returns:
         cost, number of samples used, and which rows for the samples and the final `th` are valid in `scratch`.
     """
-    work, H, g, H2, g2, A, step, frame, new_frame, trial, _ = scratch
-    p = FREEDOM[kind]
-    frame_of(kind, th, frame)
-    goes_on = steps > 0
-    cost, used = normal_equations(kind, th, frame, x, y, z, sigma, perspective, scale, trim, H, g, work, held, goes_on)
+    at, work = scratch.at, scratch.work
+    put1(at.th, th)
+    frame_of(kind, th, at.frame)
+    cost, at.used[0] = normal_equations(
+        kind, th, at.frame, x, y, z, sigma, perspective, scale, trim, at.H, at.g, work, held, steps > 0
+    )
     held = min(held, LOADED)
-    damping, is_fresh = 1e-4, True
-    for turn in range(steps):
-        if not free_step(H, g, fixed, damping, p, A, step):
-            damping = next_damping(damping, False, RULE)
-            if damping > RULE.most:
-                break
-            continue
-        small = 0.0
-        for a in range(p):
-            small = max(small, abs(step[a]) * np.sqrt(H[a, a]))
-        goes_on = turn + 1 < steps and not small < STEP_GOAL * 30.0
-        step_into(kind, th, frame, step, trial)
-        frame_of(kind, trial, new_frame)
-        new_cost, new_used = normal_equations(
-            kind, trial, new_frame, x, y, z, sigma, perspective, scale, trim, H2, g2, work, held, goes_on
-        )
-        is_fresh = new_cost <= cost and new_used >= p
-        if is_fresh:
-            cost, used = new_cost, new_used
-            for i in range(SIZE):
-                th[i] = trial[i]
-            for i in range(6):
-                frame[i] = new_frame[i]
-            if not goes_on:
-                break
-            for a in range(p):
-                g[a] = g2[a]
-                for b in range(p):
-                    H[a, b] = H2[a, b]
-        elif small < STEP_GOAL:
-            break
-        damping = next_damping(damping, is_fresh, RULE)
-        if damping > RULE.most:
-            break
-    return cost, used, ERRED if is_fresh and held == LOADED else held
+    problem = Problem(kind, x, y, z, sigma, perspective, scale, trim, fixed, held, work, scratch.A)
+    cost, is_fresh = minimise(solve, move, evaluate, accept, problem, at, scratch.trial, cost, RULE, steps, STEP_GOAL)
+    put1(th, at.th)
+    return cost, int(at.used[0]), ERRED if is_fresh and held == LOADED else held
+
+
+@inlined(early=True)
+def solve(problem: Problem, at: Point, damping: float) -> float:
+    """Write the damped step into `at`; returns its largest entry in standard deviations, -1 where there is no step."""
+    p = FREEDOM[problem.kind]
+    if not free_step(at.H, at.g, problem.fixed, damping, p, problem.A, at.step):
+        return -1.0
+    largest = 0.0
+    for a in range(p):
+        largest = max(largest, abs(at.step[a]) * np.sqrt(at.H[a, a]))
+    return largest
+
+
+@inlined(early=True)
+def move(problem: Problem, at: Point, trial: Point) -> None:
+    """Write the surface after the step of `at` into `trial`."""
+    step_into(problem.kind, at.th, at.frame, at.step, trial.th)
+    frame_of(problem.kind, trial.th, trial.frame)
+
+
+@inlined(early=True)
+def evaluate(problem: Problem, at: Point, is_last: bool) -> float:
+    """Return the cost of a surface and write its equations; the cost is infinite where too few samples are used."""
+    cost, used = normal_equations(
+        problem.kind, at.th, at.frame, problem.x, problem.y, problem.z, problem.sigma, problem.perspective,
+        problem.scale, problem.trim, at.H, at.g, problem.work, problem.held, not is_last,
+    )  # fmt: skip
+    at.used[0] = used
+    return cost if used >= FREEDOM[problem.kind] else np.inf
+
+
+@inlined(early=True)
+def accept(problem: Problem, at: Point, trial: Point, is_last: bool) -> None:
+    """Copy `trial` into `at`, without the equations after the last step."""
+    for i in range(SIZE):
+        at.th[i] = trial.th[i]
+    for i in range(6):
+        at.frame[i] = trial.frame[i]
+    at.used[0] = trial.used[0]
+    if not is_last:
+        for a in range(FREEDOM[problem.kind]):
+            at.g[a] = trial.g[a]
+            for b in range(FREEDOM[problem.kind]):
+                at.H[a, b] = trial.H[a, b]
 
 
 @compiled

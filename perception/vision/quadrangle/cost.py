@@ -7,16 +7,19 @@ Perturbations are ordered translation, then rotation: t <- t + d, R <- Exp(w) R.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
-from hal.least_squares import DampingRule, next_damping, solve_damped
+from hal.least_squares import DampingRule, minimise, solve_damped
+from hal.small_algebra import put1, put2
 from perception.vision.quadrangle.small_vectors import cross3, mix3, product3
 
 CONVERGED = 1e-9  # predicted decrease of chi-square at which to stop: 3e-5 of a standard deviation
 MAX_STEPS = 60
-RULE = DampingRule(fall=0.1, rise=8.0, least=0.0, restart=1e-4, most=1e12)
+RULE = DampingRule(start=1e-4, fall=0.1, rise=8.0, least=0.0, restart=1e-4, most=1e12)
 LEAST_PIVOT = 1e-14  # relative to the Gauss-Newton matrix; below it the Hessian counts as indefinite
 
 
@@ -177,8 +180,8 @@ def bend(y0: float, y1: float, y2: float, iz: float, u: float, v: float, lu: flo
 def newton_step(H: Array, N: Array, damping: float, fallback: float, g: Array, x: Array, L: Array) -> float:
     """Fill x (n,) with the damped Newton step at gradient g; returns the predicted decrease, -1 where there is no step.
 
-    Where the Hessian H is indefinite, the step is that of the Gauss-Newton matrix N, damped by `fallback`. `L` (n, n)
-    receives the Cholesky factor.
+    Where the Hessian H is indefinite, the step is that of the Gauss-Newton matrix N, damped by `fallback`. Gauss-Newton
+    alone converges slowly near fronto-parallel poses, where two minima merge. `L` (n, n) receives the Cholesky factor.
     """
     n = g.shape[0]
     for i in range(n):
@@ -187,41 +190,65 @@ def newton_step(H: Array, N: Array, damping: float, fallback: float, g: Array, x
     return fall if fall >= 0.0 else solve_damped(N, N, fallback, 0.0, LEAST_PIVOT, x, L, n)
 
 
+class Problem(NamedTuple):
+    """Object points X (4, 3), image points m (4, 2), their information A (4, 3), and scratch for a factor (6, 6)."""
+
+    X: Array
+    m: Array
+    A: Array
+    L: Array
+
+
+class Point(NamedTuple):
+    """Pose R (3, 3), t (3,); `expand`'s derivatives g, N, H and the step x (6,) there. A trial pose has none of its own."""
+
+    R: Array
+    t: Array
+    g: Array
+    N: Array
+    H: Array
+    x: Array
+
+
+@inlined
+def solve(problem: Problem, at: Point, damping: float) -> float:
+    """Write the damped Newton step into `at` and return the predicted decrease; -1 where there is no step."""
+    return newton_step(at.H, at.N, damping, damping, at.g, at.x, problem.L)
+
+
+@inlined
+def move(problem: Problem, at: Point, trial: Point) -> None:  # noqa: ARG001  # `minimise` passes it
+    """Write the pose after the step of `at` into `trial`."""
+    put2(trial.R, product3(rotation_of(at.x[3:]), at.R))
+    put1(trial.t, mix3(1.0, at.t, 1.0, at.x))
+
+
+@inlined
+def evaluate(problem: Problem, at: Point, is_last: bool) -> float:  # noqa: ARG001  # the derivatives follow in `accept`
+    """Return chi-square at a pose."""
+    return chi_square(at.R, at.t, problem.X, problem.m, problem.A)
+
+
+@inlined
+def accept(problem: Problem, at: Point, trial: Point, is_last: bool) -> None:
+    """Move `at` to `trial` and write the derivatives there, which a last step hardly changes."""
+    put2(at.R, trial.R)
+    put1(at.t, trial.t)
+    if not is_last:
+        expand(at.R, at.t, problem.X, problem.m, problem.A, at.g, at.N, at.H)
+
+
 @compiled
-def minimise(R: Array, t: Array, X: Array, m: Array, A: Array) -> tuple[Array, Array, float, Array, int]:
+def find_minimum(R: Array, t: Array, X: Array, m: Array, A: Array) -> tuple[Array, Array, float, Array]:
     """Find the local minimum of chi-square near a start by damped Newton steps.
 
-    Where the Hessian is indefinite, a Gauss-Newton step is taken instead. Gauss-Newton alone converges slowly near
-    fronto-parallel poses, where two minima merge.
-
-    Returns: R, t, chi-square, Gauss-Newton matrix (6, 6), steps taken.
+    Returns: R, t, chi-square (infinite if the start is behind the camera), Gauss-Newton matrix (6, 6).
     """
-    g, x = np.empty(6), np.empty(6)
-    N, H, L = np.empty((6, 6)), np.empty((6, 6)), np.zeros((6, 6))
+    g, x, N, H, L = np.empty(6), np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     cost = expand(R, t, X, m, A, g, N, H)
     if not np.isfinite(cost):
-        return R, t, np.inf, N, 0
-    damping = 1e-4
-    steps = 0
-    while steps < MAX_STEPS:
-        steps += 1
-        fall = newton_step(H, N, damping, damping, g, x, L)
-        if fall < 0.0:
-            damping = next_damping(damping, False, RULE)
-            continue
-        R_new = product3(rotation_of(x[3:]), R)
-        t_new = mix3(1.0, t, 1.0, x)
-        if fall < CONVERGED:
-            cost_new = chi_square(R_new, t_new, X, m, A)
-            if cost_new <= cost:
-                return R_new, t_new, cost_new, N, steps
-            return R, t, cost, N, steps
-        cost_new = chi_square(R_new, t_new, X, m, A)
-        is_lower = cost_new < cost
-        if is_lower:
-            R, t = R_new, t_new
-            cost = expand(R, t, X, m, A, g, N, H)
-        damping = next_damping(damping, is_lower, RULE)
-        if damping > RULE.most:
-            break
-    return R, t, cost, N, steps
+        return R, t, np.inf, N
+    at, trial = Point(R.copy(), t.copy(), g, N, H, x), Point(np.empty((3, 3)), np.empty(3), g, N, H, x)
+    problem = Problem(X, m, A, L)
+    cost, _ = minimise(solve, move, evaluate, accept, problem, at, trial, cost, RULE, MAX_STEPS, CONVERGED)
+    return at.R, at.t, cost, N

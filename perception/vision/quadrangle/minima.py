@@ -8,7 +8,7 @@ import numpy as np
 from hal.arrays import Array
 from hal.jit import compiled, inlined
 from hal.small_algebra import put1, put2
-from perception.vision.quadrangle.cost import chi_square, minimise, turn_onto
+from perception.vision.quadrangle.cost import chi_square, find_minimum, turn_onto
 from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, times3, unit3
 from perception.vision.quadrangle.three_point import three_point
 
@@ -103,7 +103,7 @@ def all_minima(X: Array, m: Array, A: Array, normal: Array, Rs: Array, ts: Array
                 continue
         put2(started[runs], R0)
         runs += 1
-        R, t, cost, N, _ = minimise(R0, t0, X, m, A)
+        R, t, cost, N = find_minimum(R0, t0, X, m, A)
         use_mirror = not use_mirror and runs == 1
         if not np.isfinite(cost):
             continue

@@ -131,8 +131,13 @@ def range_module(name: str) -> ModuleType:
 
 
 def _cases(gen: ModuleType, scene: str, seeds: int, **kind: Any) -> list[dict[str, Any]]:
+    return drawn_cases(gen, scene, 100, seeds, **kind)
+
+
+def drawn_cases(gen: ModuleType, scene: str, first: int, seeds: int, **kind: Any) -> list[dict[str, Any]]:
+    """Return cases of one scene of the generator, of the seeds from `first` on."""
     cases = []
-    for seed in range(100, 100 + seeds):
+    for seed in range(first, first + seeds):
         case = gen.make(scene, seed, **kind)
         case["meta"] = json.loads(json.dumps(case["meta"], default=lambda o: o.tolist()))
         cases.append(case)

@@ -109,15 +109,19 @@ class SimLineScanner(SimDevice[RangeImage]):
 
     def _await_next_scan(self, tick: int) -> None:
         """Schedule the ticks of the next scan whose first beam comes after `tick`."""
-        beam_ticks = self._beam_ticks
+        beam_ticks, kept = self._beam_ticks, self._kept_scans
         period = self._world.rate_hz / self._options.line_rate_hz
         end = round(math.ceil((tick + 1 + beam_ticks[0]) / period) * period)
         for ahead in np.unique(beam_ticks)[::-1]:
-            self._world.at((end - int(ahead)) / self._world.rate_hz, lambda: self._measure_part(end))
+            self._world.at((end - int(ahead)) / self._world.rate_hz, lambda: self._measure_part(end, kept))
 
-    def _measure_part(self, end: int) -> None:
-        """Measure the beams of the present tick; the last of them completes the scan."""
-        if self._kept_scans is None:
+    def _measure_part(self, end: int, kept: list[Stamped[RangeImage]] | None) -> None:
+        """Measure the beams of the present tick; the last of them completes the scan.
+
+        Args:
+            kept: the recording that this tick was planned for; it may have ended, and another one begun.
+        """
+        if self._kept_scans is None or self._kept_scans is not kept:
             return
         frame = self._world.frame
         ahead = end - frame.snapshot.tick

@@ -21,17 +21,20 @@ SAME_BRANCH_RAD = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sweep:
-    """Three declared motions, each from rest to rest; after the last one the arm is back where it began.
+    """Four declared motions, each from rest to rest; after the last one the arm is back where it began.
 
     Attributes:
         out: to the first line.
         across: over all lines, at the rate of the sweep.
+        again: over all lines the other way. What a late time stamp turns one way in the first pass, it turns the other
+            way in this one, so the two show the delay.
         back: to the initial pose.
         half_rad: the lines lie up to this angle on both sides of the initial pose.
     """
 
     out: CartesianPath
     across: CartesianPath
+    again: CartesianPath
     back: CartesianPath
     half_rad: float
 
@@ -68,11 +71,13 @@ def plan_sweep(
     for half_rad in HALVES_RAD:
         out = turned(base_from_scanner, half_rad)
         across = turned(out[-1], -2.0 * half_rad)
+        again = turned(across[-1], 2.0 * half_rad)
         if _is_free(context, across, flange_from_scanner, start_rad, width_m):
             return Sweep(
                 out=motion(out, "to the first line", QUICK_RAD_PER_S),
                 across=motion(across, "sweep", rate_rad_per_s),
-                back=motion(turned(across[-1], half_rad), "back from the last line", QUICK_RAD_PER_S),
+                again=motion(again, "sweep back", rate_rad_per_s),
+                back=motion(turned(again[-1], -half_rad), "back from the first line", QUICK_RAD_PER_S),
                 half_rad=half_rad,
             )
     raise Unreachable(

@@ -2,29 +2,30 @@
 
 base_point = base_from_scanner(t) r (sin a, 0, cos a),   t = end of scan - |last beam's angle - a| T / (2 pi)
 
-r is the range of a beam, a its angle in the scan plane, and T the period of the scanner's rotation.
+r is the range of a beam, a its angle in the scan plane, and T the period of the scanner's rotation. Two passes in opposite
+directions show by how much the time stamps are late: a delay turns the scene of each pass the way of its motion.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from hal.arrays import Array
 from hal.devices import RangeImage, RangeScannerCapabilities
-from hal.errors import InvalidRequest, StaleReading
-from hal.geometry import interpolate
+from hal.errors import InvalidRequest, NotFound, StaleReading
 from hal.readings import Quality, Stamped
 from perception.range.from_points import image_from_points
 from perception.range.sensor import PinholeSensor
 
 LONGEST_GAP_S = 0.1  # between two poses; at 1 m/s^2 the path deviates at most 1.3 mm from a straight line in this time
-KNOTS = 9  # poses per scan; the poses of beams between two of them are interpolated
+DELAY_STEP_S, DELAY_ROUNDS = 0.02, 3  # over a shorter step the noise of the depths would count
+MOST_DELAY_S = 0.1  # older data are left out by the drivers
+OUTLIER = 5.0  # median deviations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,46 +40,65 @@ class ScannerTrack:
     times_s: Sequence[float]
     base_from_scanner: Sequence[RigidTransform]
 
-    def at(self, time_s: float) -> RigidTransform:
-        """Return the pose at a time between two known ones, interpolated.
+    def in_base(self, in_scanner_m: Array, times_s: Array) -> Array:
+        """Return points (n, 3) in the base frame, metres, each with the scanner's pose at its own time.
+
+        Between two known poses the translation is interpolated linearly, and the rotation about a fixed axis.
 
         Raises:
-            StaleReading: the time lies outside the track or in a gap of it.
+            StaleReading: a time lies outside the track or in a gap of it.
         """
-        after = bisect_left(self.times_s, time_s)
-        if after < len(self.times_s) and self.times_s[after] == time_s:
-            return self.base_from_scanner[after]
-        if not 0 < after < len(self.times_s):
+        known_s = np.asarray(self.times_s, np.float64)
+        if len(known_s) < 2 or times_s.min() < known_s[0] or times_s.max() > known_s[-1]:
             raise StaleReading("no arm pose from the time of the scan", hint="record poses before and after the sweep")
-        start_s, end_s = self.times_s[after - 1], self.times_s[after]
-        if end_s - start_s > LONGEST_GAP_S:
-            gap = f"{end_s - start_s:.2f} s"
+        after = np.clip(np.searchsorted(known_s, times_s), 1, len(known_s) - 1)
+        longest_s = float((known_s[after] - known_s[after - 1]).max())
+        if longest_s > LONGEST_GAP_S:
+            gap = f"{longest_s:.2f} s"
             raise StaleReading(f"arm poses have a gap of {gap} at the time of the scan", hint="read the arm more often")
-        fraction = (time_s - start_s) / (end_s - start_s)
-        return interpolate(self.base_from_scanner[after - 1], self.base_from_scanner[after], fraction)
+        known_m = np.stack([pose.translation for pose in self.base_from_scanner])
+        shift_m = np.stack([np.interp(times_s, known_s, axis_m) for axis_m in known_m.T], axis=1)
+        turns = Slerp(known_s, Rotation.concatenate([pose.rotation for pose in self.base_from_scanner]))
+        return np.asarray(turns(times_s).apply(in_scanner_m) + shift_m)
 
     def covers(self, start_s: float, end_s: float) -> bool:
         """Return whether poses are known from `start_s` or before until `end_s` or after."""
         return bool(len(self.times_s)) and self.times_s[0] <= start_s and end_s <= self.times_s[-1]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SweepPass:
+    """The scans of one motion over all lines, and the poses of the scanner during it."""
+
+    scans: Sequence[Stamped[RangeImage]]
+    track: ScannerTrack
+
+    def covered(self, c: RangeScannerCapabilities, delay_s: float = 0.0) -> list[Stamped[RangeImage]]:
+        """Return the scans with a known pose for every beam, with stamps that are not late any more."""
+        moved = [replace(scan, host_time_s=scan.host_time_s - delay_s) for scan in self.scans]
+        return [s for s in moved if self.track.covers(float(beam_times_s(s.host_time_s, c)[0]), s.host_time_s)]
+
+    def points(self, c: RangeScannerCapabilities, delay_s: float) -> Array:
+        """Return the points (n, 3) of all covered scans in the base frame, metres."""
+        beams = [_beams(scan, c) for scan in self.covered(c, delay_s)]
+        if not sum(len(times_s) for _, times_s in beams):
+            return np.empty((0, 3))
+        return self.track.in_base(np.concatenate([b[0] for b in beams]), np.concatenate([b[1] for b in beams]))
+
+
 def image_from_sweep(
-    scans: Iterable[Stamped[RangeImage]],
+    passes: Sequence[SweepPass],
     capabilities: RangeScannerCapabilities,
     *,
-    times_s: Sequence[float],
-    base_from_scanner: Sequence[RigidTransform],
     base_from_view: RigidTransform,
     half_height_rad: float,
 ) -> tuple[Array, PinholeSensor]:
     """Return depth (H, W) in metres and geometry of the image that a range camera at `base_from_view` would have taken.
 
-    Only scans with a known pose for every beam are used. A pixel is as wide as the step between two beams in the middle
-    of the image, and as high as the rotation between two scans.
+    A pixel is as wide as the step between two beams in the middle of the image, and as high as the rotation between two
+    scans of one pass. With two passes the delay of the time stamps is estimated and taken out.
 
     Args:
-        times_s: increasing times on the cell's clock at which the scanner's pose is known.
-        base_from_scanner: the pose at each of them.
         base_from_view: usually the scanner's pose half way through the sweep.
         half_height_rad: half of the angle that was swept about the scanner's x axis.
 
@@ -87,14 +107,11 @@ def image_from_sweep(
         NotFound: no point falls into the view.
         StaleReading: the known poses have a gap.
     """
-    track = ScannerTrack(times_s=times_s, base_from_scanner=base_from_scanner)
     c = capabilities
-    covered = [s for s in scans if track.covers(float(beam_times_s(s.host_time_s, c)[0]), s.host_time_s)]
-    parts = [scan_points(scan, c, track) for scan in covered]
-    points = np.concatenate(parts) if parts else np.empty((0, 3))
     step_rad = max(abs(c.step_angle_rad), 1e-4)
     half_width_rad = min(0.5 * (c.width - 1) * step_rad, half_height_rad)
-    line_rad = max(2.0 * half_height_rad / max(len(covered), 1), step_rad)
+    lines = max(len(one.covered(c)) for one in passes)
+    line_rad = max(2.0 * half_height_rad / max(lines, 1), step_rad)
     width = 2 * max(2, round(math.tan(half_width_rad) / step_rad))
     height = 2 * max(2, round(math.tan(half_height_rad) / line_rad))
     view = PinholeSensor(
@@ -105,7 +122,47 @@ def image_from_sweep(
         cx_px=(width - 1) / 2.0,
         cy_px=(height - 1) / 2.0,
     )
+    delay_s = delay_between(passes[0], passes[1], c, base_from_view, view) if len(passes) == 2 else 0.0
+    points = np.concatenate([one.points(c, delay_s) for one in passes])
     return image_from_points(points, base_from_view, view), view
+
+
+def delay_between(
+    first: SweepPass,
+    second: SweepPass,
+    c: RangeScannerCapabilities,
+    base_from_view: RigidTransform,
+    view: PinholeSensor,
+) -> float:
+    """Return by how many seconds the stamps are late, from two passes in opposite directions.
+
+    It is the delay at which both passes see the same depths, by Gauss-Newton over the pixels that both see; pixels at
+    jumps of the depth do not count. Zero if the scene does not show it.
+    """
+
+    def apart_m(delay_s: float) -> Array:
+        try:
+            return np.subtract(
+                *(image_from_points(p.points(c, delay_s), base_from_view, view) for p in (first, second))
+            )
+        except NotFound:
+            return np.full((view.height_px, view.width_px), np.nan)
+
+    per_s = (apart_m(DELAY_STEP_S) - apart_m(-DELAY_STEP_S)) / (2.0 * DELAY_STEP_S)
+    delay_s = 0.0
+    for _ in range(DELAY_ROUNDS):
+        apart = apart_m(delay_s)
+        known = np.isfinite(apart) & np.isfinite(per_s)
+        if not known.any():
+            return 0.0
+        middle_m = np.median(apart[known])
+        known &= np.abs(np.nan_to_num(apart) - middle_m) <= OUTLIER * np.median(np.abs(apart[known] - middle_m)) + 1e-9
+        slope = per_s[known]
+        if not slope @ slope > 0.0:
+            return 0.0
+        delay_s -= float(slope @ apart[known] / (slope @ slope))
+        delay_s = min(max(delay_s, -MOST_DELAY_S), MOST_DELAY_S)
+    return delay_s
 
 
 def beam_times_s(end_s: float, c: RangeScannerCapabilities) -> Array:
@@ -125,30 +182,16 @@ def scan_points(scan: Stamped[RangeImage], c: RangeScannerCapabilities, track: S
         InvalidRequest: the scan is not that of a line scanner.
         StaleReading: the track does not cover the scan.
     """
+    in_scanner_m, times_s = _beams(scan, c)
+    return track.in_base(in_scanner_m, times_s) if len(times_s) else np.empty((0, 3))
+
+
+def _beams(scan: Stamped[RangeImage], c: RangeScannerCapabilities) -> tuple[Array, Array]:
+    """Return the points (n, 3) of one scan in the scanner's frame, metres, and the time of each."""
     if not c.needs_sweep:
         raise InvalidRequest("only lines are swept", hint="a range camera's images need no sweep")
     range_m = scan.value.depth_m[0].astype(np.float64)
-    seen = np.isfinite(range_m)
-    if scan.quality is Quality.INVALID or not np.any(seen):
-        return np.empty((0, 3))
+    seen = np.isfinite(range_m) & (scan.quality is not Quality.INVALID)
     angle_rad = c.first_angle_rad + np.arange(c.width) * c.step_angle_rad
-    in_scanner = range_m[:, np.newaxis] * np.stack([np.sin(angle_rad), 0.0 * angle_rad, np.cos(angle_rad)], axis=1)
-    return _in_base(in_scanner[seen], beam_times_s(scan.host_time_s, c)[seen], track)
-
-
-def _in_base(in_scanner: Array, times_s: Array, track: ScannerTrack) -> Array:
-    """Transform points (n, 3) to the base frame, each with the scanner's pose at its own time.
-
-    Between knots the translation is interpolated linearly, and the rotation about a fixed axis.
-    """
-    knots_s = np.linspace(times_s[0], times_s[-1], KNOTS)
-    poses = [track.at(float(knot_s)) for knot_s in knots_s]
-    place = np.clip(np.searchsorted(knots_s, times_s) - 1, 0, KNOTS - 2)
-    step_s = max(float(knots_s[1] - knots_s[0]), 1e-12)
-    fraction = (times_s - knots_s[place]) / step_s
-    shift_m = np.stack([pose.translation for pose in poses])
-    turns = Rotation.concatenate([pose.rotation for pose in poses])
-    delta = (turns[place].inv() * turns[place + 1]).as_rotvec()
-    turn = turns[place] * Rotation.from_rotvec(delta * fraction[:, np.newaxis])
-    translation_m = shift_m[place] + fraction[:, np.newaxis] * (shift_m[place + 1] - shift_m[place])
-    return np.asarray(turn.apply(in_scanner) + translation_m)
+    in_scanner_m = range_m[:, np.newaxis] * np.stack([np.sin(angle_rad), 0.0 * angle_rad, np.cos(angle_rad)], axis=1)
+    return in_scanner_m[seen], beam_times_s(scan.host_time_s, c)[seen]

@@ -20,10 +20,10 @@ from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import NotFound, StaleReading, Unsupported
 from hal.frames import frame_tree
 from hal.geometry import UncertainPose
-from hal.motion import Hold, MotionOutcome
+from hal.motion import CartesianPath, Hold, MotionOutcome
 from hal.readings import Cause, Quality, Stamped
 from manipulation import plan_sweep, plausibility
-from perception.range import PinholeSensor, image_from_sweep
+from perception.range import PinholeSensor, ScannerTrack, SweepPass, image_from_sweep
 from service.operations.session import Session
 from service.operations.travel import kinematics, skill_context
 
@@ -32,7 +32,7 @@ OLDEST_S = 0.2  # a frame may have been taken this long before the call; its tim
 SETTLE_S = 0.06  # time in which lamps and arm come to rest
 SWEPT_RAD = 0.96  # angle that the lines of a sweep are spread over
 LEAST_LINES, MOST_LINES = 96, 160  # of a swept image; the lines may be closer to each other than the beams of a line
-LONGEST_SWEEP_S = 30.0
+LONGEST_PASS_S = 20.0  # of the two passes of a sweep
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -207,7 +207,7 @@ def _refuse_frozen(session: Session, name: str, sample: Stamped[Any], array: NDA
 
 
 def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
-    """Sweep the line scanner `name` about the pose in which the arm stands, and return to it.
+    """Sweep the line scanner `name` to and fro about the pose in which the arm stands, and return to it.
 
     Raises:
         Unsupported: its driver cannot record scans.
@@ -230,21 +230,12 @@ def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
         width_m=state.gripper_width_m,
     )
     session.run(sweep.out)
-    device.start_recording(deadline=deadline())
-    report = session.run(sweep.across)
-    scans = device.end_recording(deadline=deadline())
+    passes = [_record(session, name, device, motion) for motion in (sweep.across, sweep.again)]
     session.run(sweep.back)
-    _refuse_frozen_lines(name, scans)
-    good = [scan for scan in scans if scan.quality is not Quality.INVALID]
-    if not good:
-        raise NotFound(f"{name} gave no valid line in a sweep of {report.duration_s:.1f} s", hint=_rate_hint(c))
-    arm = kinematics(session)
     depth_m, view = image_from_sweep(
-        good,
+        passes,
         c,
-        times_s=tuple(report.log.started_s + report.log.times_s),
-        base_from_scanner=tuple(arm.tool(q, mount) for q in report.log.positions_rad),
-        base_from_view=arm.tool(state.position_rad, mount),
+        base_from_view=kinematics(session).tool(state.position_rad, mount),
         half_height_rad=sweep.half_rad,
     )
     as_camera = replace(
@@ -257,13 +248,35 @@ def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
         cx=view.cx_px,
         cy=view.cy_px,
     )
-    return SweptImage(depth_m=depth_m.astype(np.float32), capabilities=as_camera, newest=good[-1])
+    return SweptImage(depth_m=depth_m.astype(np.float32), capabilities=as_camera, newest=passes[-1].scans[-1])
+
+
+def _record(session: Session, name: str, device: Any, motion: CartesianPath) -> SweepPass:
+    """Run one motion over all lines and return the valid scans of the line scanner `name` during it.
+
+    Raises:
+        NotFound: no valid scan came.
+    """
+    device.start_recording(deadline=deadline())
+    report = session.run(motion)
+    scans = device.end_recording(deadline=deadline())
+    _refuse_frozen_lines(name, scans)
+    good = [scan for scan in scans if scan.quality is not Quality.INVALID]
+    if not good:
+        what = f"{name} gave no valid line in a sweep of {report.duration_s:.1f} s"
+        raise NotFound(what, hint=_rate_hint(device.capabilities()))
+    arm, mount = kinematics(session), session.mount(name).parent_from_child
+    track = ScannerTrack(
+        times_s=tuple(report.log.started_s + report.log.times_s),
+        base_from_scanner=tuple(arm.tool(q, mount) for q in report.log.positions_rad),
+    )
+    return SweepPass(scans=good, track=track)
 
 
 def sweep_rate_rad_per_s(c: RangeScannerCapabilities) -> float:
     """Return the speed of the wrist: one angular step of the beams per line, within limits on lines and duration."""
     line_rad = np.clip(abs(c.step_angle_rad), SWEPT_RAD / MOST_LINES, SWEPT_RAD / LEAST_LINES)
-    return float(max(line_rad * c.rate_hz, SWEPT_RAD / LONGEST_SWEEP_S))
+    return float(max(line_rad * c.rate_hz, SWEPT_RAD / LONGEST_PASS_S))
 
 
 def _refuse_frozen_lines(name: str, scans: Sequence[Stamped[RangeImage]]) -> None:

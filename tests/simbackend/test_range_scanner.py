@@ -90,6 +90,12 @@ def test_a_line_scanner_keeps_its_scans_while_it_records_and_each_is_of_its_own_
     np.testing.assert_allclose(np.diff([scan.host_time_s for scan in scans]), 0.04, atol=0.0021)
     for scan in scans:  # the arm rests, so all scans are equal
         np.testing.assert_allclose(scan.value.depth_m, line, atol=2e-5)
+    scanner.start_recording(deadline=bench.deadline())  # at once, while a scan of the recording before is planned
+    bench.clock.sleep(0.3)
+    again = scanner.end_recording(deadline=bench.deadline())
+    assert 6 <= len(again) <= 8
+    for scan in again:
+        np.testing.assert_allclose(scan.value.depth_m, line, atol=2e-5)
     bench.clock.sleep(0.2)
     assert scanner.end_recording(deadline=bench.deadline()) == ()
 

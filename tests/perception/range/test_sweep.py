@@ -1,18 +1,25 @@
 """A line scanner swept by the wrist measures planes as flat although the wrist moves during each scan."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from hal.arrays import Array
 from hal.devices import RangeImage, RangeScannerCapabilities
 from hal.errors import InvalidRequest, NotFound, StaleReading
 from hal.geometry import identity, transform_rpy
 from hal.readings import Cause, Quality, Stamped
 from perception.range import fit_plane_near
-from perception.range.sweep import ScannerTrack, beam_times_s, image_from_sweep, scan_points
+from perception.range.sweep import (
+    ScannerTrack,
+    SweepPass,
+    beam_times_s,
+    delay_between,
+    image_from_sweep,
+    scan_points,
+)
 
 LINE = RangeScannerCapabilities(
     projection="polar",
@@ -99,9 +106,11 @@ def test_unseen_beams_and_invalid_scans_give_no_points() -> None:
 
 def test_times_without_poses_are_refused() -> None:
     with pytest.raises(StaleReading, match="no arm pose"):
-        track().at(5.0)
+        track().in_base(np.ones((1, 3)), np.array([5.0]))
     with pytest.raises(StaleReading, match="gap"):
-        ScannerTrack(times_s=[0.0, 0.5], base_from_scanner=[identity(), identity()]).at(0.25)
+        ScannerTrack(times_s=[0.0, 0.5], base_from_scanner=[identity(), identity()]).in_base(
+            np.ones((1, 3)), np.array([0.25])
+        )
 
 
 def test_only_lines_are_swept() -> None:
@@ -109,23 +118,24 @@ def test_only_lines_are_swept() -> None:
         scan_points(scan_of_the_plane(0.5), IMAGE, track())
 
 
-def nodding_over_a_plane(seed: int, sigma_m: float) -> dict[str, Any]:
-    """Return scans and poses, for `image_from_sweep`, of a scanner that rotates at 0.4 rad/s before a tilted plane."""
+def nodding_over_a_plane(seed: int, sigma_m: float, *, sign: float = 1.0, late_s: float = 0.0) -> SweepPass:
+    """Return a pass of a scanner that rotates at 0.4 rad/s before a tilted plane, with stamps that are late."""
     rng = np.random.default_rng(seed)
+
+    def turned(time_s: Array) -> Rotation:
+        return Rotation.from_rotvec(np.multiply.outer(sign * 0.4 * (1.25 - time_s), [1.0, 0.0, 0.0]))
+
     times_s = np.arange(0.0, 2.5, 0.008)
-    poses = [RigidTransform.from_rotation(Rotation.from_rotvec([0.4 * (1.25 - t), 0.0, 0.0])) for t in times_s]
+    poses = [RigidTransform.from_rotation(turned(t)) for t in times_s]
     scans = []
     for k, end_s in enumerate(np.arange(0.06, 2.45, 0.02)):
-        range_m = []
-        for beam, t in enumerate(beam_times_s(float(end_s), FINE)):
-            turn = Rotation.from_rotvec([0.4 * (1.25 - t), 0.0, 0.0])
-            angle = FINE.first_angle_rad + beam * FINE.step_angle_rad
-            along = turn.apply([np.sin(angle), 0.0, np.cos(angle)])
-            range_m.append(NORMAL @ POINT_M / (NORMAL @ along) + rng.normal(0.0, sigma_m))
-        scans.append(
-            Stamped(value=RangeImage(depth_m=np.array([range_m], np.float32)), host_time_s=float(end_s), sequence=k)
-        )
-    return {"scans": scans, "times_s": list(times_s), "base_from_scanner": poses}
+        angle = FINE.first_angle_rad + np.arange(FINE.width) * FINE.step_angle_rad
+        beams = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1)
+        along = turned(beam_times_s(float(end_s), FINE)).apply(beams)
+        range_m = NORMAL @ POINT_M / (along @ NORMAL) + rng.normal(0.0, sigma_m, FINE.width)
+        value = RangeImage(depth_m=np.array([range_m], np.float32))
+        scans.append(Stamped(value=value, host_time_s=float(end_s) + late_s, sequence=k))
+    return SweepPass(scans=scans, track=ScannerTrack(times_s=list(times_s), base_from_scanner=poses))
 
 
 NORMAL = np.array([0.2, -0.1, -0.97]) / np.linalg.norm([0.2, -0.1, -0.97])
@@ -133,18 +143,19 @@ POINT_M = np.array([0.0, 0.0, 0.6])
 FINE = replace(LINE, width=128, rate_hz=50.0, first_angle_rad=-0.4, step_angle_rad=0.8 / 127)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_image_of_a_sweep_gives_the_plane_within_its_covariance(seed: int) -> None:
-    given = nodding_over_a_plane(seed, 0.0006)
-    depth_m, view = image_from_sweep(
-        given["scans"],
-        FINE,
-        times_s=given["times_s"],
-        base_from_scanner=given["base_from_scanner"],
-        base_from_view=identity(),
-        half_height_rad=0.45,
-    )
-    assert np.isfinite(depth_m).mean() > 0.9
+@pytest.mark.parametrize("late_s", [None, 0.013, 0.06])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_image_of_a_sweep_gives_the_plane_within_its_covariance_however_late_its_stamps(
+    seed: int, late_s: float | None
+) -> None:
+    """One pass with true stamps, or two with late ones: 13 ms turn the plane of one pass by 0.3 degrees."""
+    passes = [nodding_over_a_plane(seed, 0.0006, late_s=late_s or 0.0)]
+    if late_s is not None:
+        passes.append(nodding_over_a_plane(seed + 10, 0.0006, sign=-1.0, late_s=late_s))
+    depth_m, view = image_from_sweep(passes, FINE, base_from_view=identity(), half_height_rad=0.45)
+    if late_s is not None:
+        assert delay_between(passes[0], passes[1], FINE, identity(), view) == pytest.approx(late_s, abs=5e-4)
+    assert np.isfinite(depth_m).mean() > 0.85
     fit = fit_plane_near(depth_m, view, point_m=POINT_M, normal=NORMAL, sigma_offset_m=0.01, sigma_angle_rad=0.02)
     feature = fit.feature
     sigma_m = np.sqrt(NORMAL @ feature.point_covariance @ NORMAL)
@@ -153,13 +164,8 @@ def test_the_image_of_a_sweep_gives_the_plane_within_its_covariance(seed: int) -
 
 
 def test_scans_before_the_first_pose_are_left_out_and_none_at_all_is_said() -> None:
-    given = nodding_over_a_plane(0, 0.0)
-    with pytest.raises(NotFound, match="none of the points"):
-        image_from_sweep(
-            given["scans"],
-            FINE,
-            times_s=[9.0, 9.1],
-            base_from_scanner=[identity(), identity()],
-            base_from_view=identity(),
-            half_height_rad=0.45,
-        )
+    track = ScannerTrack(times_s=[9.0, 9.1], base_from_scanner=[identity(), identity()])
+    passes = [SweepPass(scans=nodding_over_a_plane(0, 0.0).scans, track=track)]
+    for given in (passes, 2 * passes):
+        with pytest.raises(NotFound, match="none of the points"):
+            image_from_sweep(given, FINE, base_from_view=identity(), half_height_rad=0.45)

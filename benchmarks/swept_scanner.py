@@ -1,0 +1,176 @@
+"""Compares the plate and the objects by a swept line scanner with those by a range camera, in the same cell and world.
+
+    python -m benchmarks.swept_scanner FIRST LAST [--cells bench ur10e] [--ways polar scip lms200 rplidar]
+
+Each seed is a bench: the range camera looks from the overview, then the cell is started again with a line scanner in its
+place, simulated (`polar`) or by its real driver over an emulated wire. The offset is that of the swept plane at the
+camera's point, along the camera's normal; sigmas are the stated ones of both fits and of the mount.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.arrays import Array
+from hal.config import Cell, EmulatorSection, load_cell
+from hal.errors import CellError
+from service.operations.acquisition import scan
+from service.operations.locate import go_to_overview, locate, plate_in
+from service.operations.range_detection import find_by_surfaces, surfaces_in
+from service.operations.session import OperationContext, Session
+from service.processes.cell import CellRuntime
+from service.processes.connection import LocalConnection
+from service.tasks.model import Task
+from service.tasks.store import TaskContext
+from service.world_model import WorldModel
+
+ROOT = Path(__file__).parents[1]
+SCANNER = "range_scanner"
+CAMERA = "camera"
+WIRES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {  # driver, its options, its emulator's
+    "scip": ("scip:scanner", {"sigma_m": 0.001}, {"scans_per_minute": 1500}),
+    "lms200": ("serial:lms200", {"baud": 500_000, "step_hundredths_deg": 50, "sigma_m": 0.001}, {"scan_s": 0.0266}),
+    "rplidar": (
+        "serial:rplidar",
+        {"scan_rate_hz": 10.0, "beams": 720, "sigma_m": 0.001},
+        {"scan_rate_hz": 10.0, "nodes": 720, "bursts": 36},
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """The plate's plane in the base frame, with its sigmas, and the names of the objects that a model matched."""
+
+    point_m: Array
+    normal: Array
+    sigma_m: float
+    sigma_rad: float
+    mount_m: float
+    mount_rad: float
+    matched: frozenset[str]
+
+
+def cell_with(name: str, way: str, seed: int) -> Cell:
+    """Return a shipped cell whose range scanner is of another kind."""
+    cell = load_cell(ROOT / f"cells/{name}.toml", seed=seed)
+    file = cell.file
+    section = file.devices[SCANNER]
+    emulators, mode = dict(file.emulators), file.cell.mode
+    driver, options = section.driver, {**section.options, "model": "pinhole" if way == CAMERA else "polar"}
+    if way in WIRES:
+        behind = {**options, "width": 256}
+        driver, options, far_options = WIRES[way]
+        mode = "mixed"
+        emulators[SCANNER] = EmulatorSection(
+            emulator=way, driver=section.driver, options=behind, emulator_options=far_options
+        )
+    devices = {**file.devices, SCANNER: section.model_copy(update={"driver": driver, "options": options})}
+    head = file.cell.model_copy(update={"mode": mode})
+    return cell.model_copy(
+        update={"file": file.model_copy(update={"devices": devices, "emulators": emulators, "cell": head})}
+    )
+
+
+@contextmanager
+def session_of(cell: Cell, folder: Path) -> Iterator[Session]:
+    """Yield a session with its own task on an inline cell."""
+    runtime = CellRuntime.start(cell, is_latched=lambda: False)
+    try:
+        yield Session(
+            context=OperationContext(
+                connection=LocalConnection(cell, runtime.objects, close=runtime.close),
+                task=TaskContext(Task(id="bench", verb="panel-pose", request={}, moves=True), folder / "artefacts"),
+                runs_dir=folder / "runs",
+                world=WorldModel(),
+            )
+        )
+    finally:
+        runtime.close()
+
+
+def seen_from_the_overview(session: Session) -> Seen:
+    """Drive to the overview, and measure plate and objects there."""
+    go_to_overview(session)
+    located = locate(session)
+    image = scan(session)
+    plane = plate_in(session, image)
+    found = find_by_surfaces(surfaces_in(image), image, session.panel, located.base_from_panel, plane.fit.surface)
+    feature, pose = plane.fit.feature, image.base_from_scanner.parent_from_child
+    mount = session.mount(SCANNER).covariance
+    return Seen(
+        point_m=pose.apply(feature.point_m),
+        normal=pose.rotation.apply(feature.direction),
+        sigma_m=float(np.sqrt(feature.direction @ feature.point_covariance @ feature.direction)),
+        sigma_rad=float(np.sqrt(np.trace(feature.direction_covariance) / 2.0)),
+        mount_m=float(np.sqrt(feature.direction @ mount[:3, :3] @ feature.direction)),
+        mount_rad=float(np.sqrt(np.trace(mount[3:, 3:]) / 3.0)),
+        matched=frozenset(s.panel_object.name for s in found if s.match is not None),
+    )
+
+
+def measure(name: str, way: str, seed: int) -> Seen:
+    """Return what one scanner sees in one world."""
+    with tempfile.TemporaryDirectory() as folder, session_of(cell_with(name, way, seed), Path(folder)) as session:
+        return seen_from_the_overview(session)
+
+
+def differences(camera: Seen, swept: Seen) -> tuple[float, float]:
+    """Return offset in metres and angle in radians between the planes of two scanners."""
+    angle_rad = float(np.arcsin(np.clip(np.linalg.norm(np.cross(camera.normal, swept.normal)), 0.0, 1.0)))
+    return float(camera.normal @ (swept.point_m - camera.point_m)), angle_rad
+
+
+def main() -> None:
+    """Print one line for each cell, way and seed, and the root mean square of each way."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("first", type=int)
+    parser.add_argument("last", type=int)
+    parser.add_argument("--cells", nargs="+", default=["bench", "ur10e"])
+    parser.add_argument("--ways", nargs="+", default=["polar", *WIRES])
+    arguments = parser.parse_args()
+    for name in arguments.cells:
+        table: dict[str, list[tuple[float, ...]]] = {way: [] for way in arguments.ways}
+        for seed in range(arguments.first, arguments.last + 1):
+            camera = measure(name, CAMERA, seed)
+            for way in arguments.ways:
+                try:
+                    swept = measure(name, way, seed)
+                except CellError as error:
+                    print(f"{name} {way} seed {seed}: {error.type_name}: {error}", flush=True)
+                    continue
+                offset_m, angle_rad = differences(camera, swept)
+                fits_m, fits_rad = np.hypot(camera.sigma_m, swept.sigma_m), np.hypot(camera.sigma_rad, swept.sigma_rad)
+                ratios = (
+                    abs(offset_m) / fits_m,
+                    angle_rad / fits_rad,
+                    abs(offset_m) / np.hypot(fits_m, camera.mount_m),
+                    angle_rad / np.hypot(fits_rad, camera.mount_rad),
+                )
+                table[way].append(ratios)
+                print(
+                    f"{name} {way} seed {seed}: {1e3 * offset_m:+.3f} mm ({ratios[0]:.2f} sigma),"
+                    f" {np.degrees(angle_rad):.3f} deg ({ratios[1]:.2f} sigma); sigmas {1e3 * swept.sigma_m:.3f} mm"
+                    f" {np.degrees(swept.sigma_rad):.3f} deg; objects {len(swept.matched)} of {len(camera.matched)}",
+                    flush=True,
+                )
+        for way, rows in table.items():
+            if rows:
+                rms = np.sqrt(np.mean(np.square(rows), axis=0))
+                print(
+                    f"{name} {way}: {len(rows)} runs, rms {rms[0]:.2f} and {rms[1]:.2f} sigma of the fits,"
+                    f" {rms[2]:.2f} and {rms[3]:.2f} of fits and mount",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()

@@ -23,7 +23,8 @@ from hal.arrays import Array
 from hal.config import Cell, EmulatorSection, load_cell
 from hal.errors import CellError
 from service.operations.acquisition import scan
-from service.operations.locate import go_to_overview, locate, plate_in
+from service.operations.find_panel import locate
+from service.operations.locate import go_to_overview, plate_in
 from service.operations.range_detection import find_by_surfaces, surfaces_in
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime

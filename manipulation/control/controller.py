@@ -47,7 +47,7 @@ from manipulation.control.sensing import (
     ToolView,
     refuse,
 )
-from manipulation.control.setpoint import SetPointLimiter, check, flange_matrix
+from manipulation.control.setpoint import SetPointLimiter, check, check_is_felt, flange_matrix
 from manipulation.control.termination import Termination, TerminationMonitor, cause_of_end, has_settled
 from manipulation.plausibility.hand import TouchMonitor
 from manipulation.plausibility.repetition import RepeatedWrench
@@ -208,6 +208,7 @@ class Controller:
     def _execute(self, motion: DeclaredMotion) -> MotionReport:
         if self._is_latched():
             raise Stopped("the stop latch is set", hint="reset the stop, then command again")
+        check_is_felt(motion, has_force_torque=self._devices.force_torque is not None)
         tool = flange_matrix(motion.flange_from_tool) if isinstance(motion, CartesianPath) else self._grip
         started_s = self._clock.now_s()
         recorder = Recorder(self._dt_s)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.errors import MotionRefused
 from hal.geometry import difference
-from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory
+from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory, Quantity
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control import braking
 from manipulation.control.sensing import DeviceFailure
@@ -19,6 +19,7 @@ START_RAD = 0.05
 START_M = 0.005
 SPEED_SLACK = 1.05
 RESTING_RAD_PER_S = 1e-4
+BY_CONTACT = (Quantity.FORCE, Quantity.TORQUE, Quantity.FORCE_RISE)
 LOOK_BACK_TICKS = 3  # with one, a jitter of 10 % in the ticks triples the following error of a steady motion
 
 
@@ -92,6 +93,19 @@ def check(motion: DeclaredMotion, kinematics: Kinematics, measured_rad: Array) -
             numbers = (motion.width_m, motion.force_n, motion.speed_m_per_s, motion.timeout_s)
             if not all(np.isfinite(n) and n >= 0.0 for n in numbers):
                 raise _refused(motion, "a number is negative or not finite", "give width, force, speed and time")
+
+
+def check_is_felt(motion: DeclaredMotion, *, has_force_torque: bool) -> None:
+    """Refuse a motion that ends or yields by contact forces in a cell that does not measure them.
+
+    Raises:
+        MotionRefused: the motion watches a force, or is compliant, and there is no force/torque sensor.
+    """
+    is_compliant = isinstance(motion, CartesianPath) and motion.compliance is not None
+    if has_force_torque or not (is_compliant or any(guard.quantity in BY_CONTACT for guard in motion.guards)):
+        return
+    what = "nothing measures the force of the contact that it makes"
+    raise _refused(motion, what, "add a device of kind force_torque to the cell file")
 
 
 def _check_trajectory(motion: JointTrajectory, kin: Kinematics, measured: Array) -> None:

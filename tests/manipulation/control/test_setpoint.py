@@ -15,10 +15,10 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.errors import MotionRefused
 from hal.geometry import perturbed
-from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory
+from hal.motion import CartesianPath, Compliance, DeclaredMotion, GripperMotion, Guard, Hold, JointTrajectory, Quantity
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control.sensing import DeviceFailure
-from manipulation.control.setpoint import SetPointLimiter, check, flange_matrix
+from manipulation.control.setpoint import SetPointLimiter, check, check_is_felt, flange_matrix
 from tests.manipulation.arms import T3
 from tests.manipulation.rig import GRIP, HOME, tool_pose
 
@@ -269,3 +269,21 @@ def test_a_set_point_that_is_no_number_is_a_failure_of_the_controller(bad: float
     with pytest.raises(DeviceFailure, match="not finite") as caught:
         made_filter().apply(wanted)
     assert caught.value.device == "controller"
+
+
+SOFT = Compliance(stiffness=(500.0,) * 6, damping=(50.0,) * 6)
+FELT = Guard(name="contact", quantity=Quantity.FORCE, limit=5.0)
+
+
+@pytest.mark.parametrize(
+    "motion", [replace(PATH, compliance=SOFT), replace(PATH, guards=(FELT,)), replace(HOLD, guards=(FELT,))]
+)
+def test_a_motion_into_contact_is_refused_where_no_sensor_measures_forces(motion: DeclaredMotion) -> None:
+    check_is_felt(motion, has_force_torque=True)
+    with pytest.raises(MotionRefused, match="nothing measures the force"):
+        check_is_felt(motion, has_force_torque=False)
+
+
+@pytest.mark.parametrize("motion", [TRAJECTORY, PATH, HOLD, GRASP])
+def test_a_free_motion_needs_no_force_sensor(motion: DeclaredMotion) -> None:
+    check_is_felt(motion, has_force_torque=False)

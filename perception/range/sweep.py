@@ -92,6 +92,7 @@ def image_from_sweep(
     *,
     base_from_view: RigidTransform,
     half_height_rad: float,
+    swept_rad: float,
 ) -> tuple[Array, PinholeSensor]:
     """Return depth (H, W) in metres and geometry of the image that a range camera at `base_from_view` would have taken.
 
@@ -99,8 +100,9 @@ def image_from_sweep(
     scans of one pass. With two passes the delay of the time stamps is estimated and taken out.
 
     Args:
-        base_from_view: usually the scanner's pose half way through the sweep.
-        half_height_rad: half of the angle that was swept about the scanner's x axis.
+        base_from_view: a pose of the scanner within the sweep.
+        half_height_rad: the image reaches by this angle to both sides of it.
+        swept_rad: angle that was swept about the scanner's x axis.
 
     Raises:
         InvalidRequest: the scans are not those of a line scanner.
@@ -111,7 +113,7 @@ def image_from_sweep(
     step_rad = max(abs(c.step_angle_rad), 1e-4)
     half_width_rad = min(0.5 * (c.width - 1) * step_rad, half_height_rad)
     lines = max(len(one.covered(c)) for one in passes)
-    line_rad = max(2.0 * half_height_rad / max(lines, 1), step_rad)
+    line_rad = max(swept_rad / max(lines, 1), step_rad)
     width = 2 * max(2, round(math.tan(half_width_rad) / step_rad))
     height = 2 * max(2, round(math.tan(half_height_rad) / line_rad))
     view = PinholeSensor(

@@ -236,7 +236,8 @@ def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
         passes,
         c,
         base_from_view=kinematics(session).tool(state.position_rad, mount),
-        half_height_rad=sweep.half_rad,
+        half_height_rad=max(sweep.up_rad, sweep.down_rad),
+        swept_rad=sweep.up_rad + sweep.down_rad,
     )
     as_camera = replace(
         c,

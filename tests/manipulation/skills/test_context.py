@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
@@ -11,6 +13,7 @@ from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.hand import Hand
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.sweep import Sweep, plan_sweep
 from tests.manipulation.arms import T3
 from tests.manipulation.planning.test_collision import make_panel
 
@@ -94,3 +97,24 @@ def test_a_wider_hand_has_its_fingers_further_apart_and_the_same_body() -> None:
         if capsule.name.startswith("finger"):
             # The round end of the capsule reaches the tip and not further.
             assert capsule.end_m[2] + capsule.radius_m == pytest.approx(GRIP.translation[2])
+
+
+def sweep_near_the_limit(to_limit_rad: float) -> Sweep:
+    """Plan a sweep with a scanner that the fifth joint nods, this far from the upper limit of that joint."""
+    upper_rad = (*T3.upper_rad[:4], PARK[4] + to_limit_rad, T3.upper_rad[5])
+    near_limit = replace(context(), kinematics=Kinematics.of(replace(T3, upper_rad=upper_rad)))
+    mount = transform_rpy((0.0, 0.0, 0.1), (0.0, 0.0, np.pi / 2))
+    return plan_sweep(near_limit, mount, rate_rad_per_s=0.3, start_rad=PARK, width_m=0.0)
+
+
+@pytest.mark.parametrize(("to_limit_rad", "expected_rad"), [(1.0, 0.48), (0.3, 0.24), (0.2, 0.16)])
+def test_a_sweep_turns_as_far_to_each_side_as_the_joint_limits_allow(to_limit_rad: float, expected_rad: float) -> None:
+    sweep = sweep_near_the_limit(to_limit_rad)
+    assert (sweep.up_rad, sweep.down_rad) == (0.48, expected_rad)
+    turned = sweep.across.base_from_tool[0].rotation.inv() * sweep.across.base_from_tool[-1].rotation
+    assert turned.magnitude() == pytest.approx(0.48 + expected_rad)
+
+
+def test_a_sweep_that_would_be_too_small_is_refused() -> None:
+    with pytest.raises(Unreachable, match=r"by 0\.48 and 0\.00 rad"):
+        sweep_near_the_limit(0.02)

@@ -152,7 +152,7 @@ def test_the_image_of_a_sweep_gives_the_plane_within_its_covariance_however_late
     passes = [nodding_over_a_plane(seed, 0.0006, late_s=late_s or 0.0)]
     if late_s is not None:
         passes.append(nodding_over_a_plane(seed + 10, 0.0006, sign=-1.0, late_s=late_s))
-    depth_m, view = image_from_sweep(passes, FINE, base_from_view=identity(), half_height_rad=0.45)
+    depth_m, view = image_from_sweep(passes, FINE, base_from_view=identity(), half_height_rad=0.45, swept_rad=0.9)
     if late_s is not None:
         assert delay_between(passes[0], passes[1], FINE, identity(), view) == pytest.approx(late_s, abs=5e-4)
     assert np.isfinite(depth_m).mean() > 0.85
@@ -168,4 +168,4 @@ def test_scans_before_the_first_pose_are_left_out_and_none_at_all_is_said() -> N
     passes = [SweepPass(scans=nodding_over_a_plane(0, 0.0).scans, track=track)]
     for given in (passes, 2 * passes):
         with pytest.raises(NotFound, match="none of the points"):
-            image_from_sweep(given, FINE, base_from_view=identity(), half_height_rad=0.45)
+            image_from_sweep(given, FINE, base_from_view=identity(), half_height_rad=0.45, swept_rad=0.9)

@@ -108,7 +108,7 @@ class Lms200(LineScanner):
         )
         line_s = (2 * beams.count + 10) * 10 / options.baud
         super().__init__(context, open_link=opener, link_name=name, max_age_s=3 * max(beams.scan_s, line_s) + 0.1)
-        self.beams = beams
+        self.beams, self.line_s = beams, line_s
         self.sigma_m = options.sigma_m
         self._options = options
         self._framer = framer(payload_bytes=2 * beams.count + 4)

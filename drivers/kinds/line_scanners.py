@@ -36,6 +36,7 @@ class LineScanner(StreamDevice[RangeImage]):
     kind = DeviceKind.RANGE_SCANNER
     beams: Beams | None = None
     sigma_m = 0.01
+    line_s = 0.0  # time that one scan takes on a slow line
     _kept: deque[Stamped[RangeImage]] | None = None
 
     def capabilities(self) -> RangeScannerCapabilities:
@@ -58,7 +59,7 @@ class LineScanner(StreamDevice[RangeImage]):
             min_range_m=b.min_range_m,
             max_range_m=b.max_range_m,
             sigma_m=self.sigma_m,
-            rate_hz=1.0 / b.scan_s,
+            rate_hz=1.0 / max(b.scan_s, self.line_s),
             first_angle_rad=b.first_rad,
             step_angle_rad=b.step_rad,
         )

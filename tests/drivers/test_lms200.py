@@ -56,6 +56,12 @@ def test_angles(field: int, step: int, beams: int) -> None:
         image = device.read_range(deadline=soon()).value
     assert c.width == beams == image.depth_m.shape[1]
     assert c.first_angle_rad == pytest.approx(-math.radians(field / 2))
+    assert c.rate_hz == pytest.approx(38_400 / 10 / (2 * beams + 10))  # the line is slower than the mirror
+
+
+def test_on_a_fast_line_the_mirror_sets_the_rate() -> None:
+    with wired(emulator.start(ScriptedScanner(), {}), DRIVER, {"baud": 500_000}) as device:
+        assert device.capabilities().rate_hz == pytest.approx(75.0, rel=0.01)
 
 
 def is_a_true_scan(image: RangeImage, c: RangeScannerCapabilities, reads: int) -> bool:

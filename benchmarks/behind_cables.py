@@ -20,7 +20,7 @@ from hal.errors import CellError
 from hal.panel import PanelObject, Shown
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
-from service.operations.evaluate import shown_of
+from service.evaluate import shown_of
 from service.operations.find_panel import locate
 from service.operations.inspect import close_ups, look_past
 from service.operations.locate import go_to_overview

@@ -43,3 +43,8 @@ def test_functions_are_short_and_take_few_parameters(room: str) -> None:
             if is_long or (parameters > PARAMETERS and not any(word in made_by for word in MANY_PARAMETERS)):
                 too_large.append(f"{file.relative_to(ROOT)}:{node.lineno} {node.name}")
     assert too_large == []
+
+
+def test_the_operations_stay_few() -> None:
+    """An operation joins a request, the faces of the wings and a typed result; mathematics belongs in a wing."""
+    assert len(list((ROOT / "service/operations").glob("*.py"))) <= 15

@@ -94,7 +94,7 @@ def _mission(context: OperationContext, request: requests.MissionRequest) -> mis
 
 
 def _evaluate(context: OperationContext, request: requests.EvaluateRequest) -> mission_results.EvaluateResult:
-    from service.operations.evaluate import evaluate
+    from service.evaluate import evaluate
 
     return evaluate(context.connection, context.runs_dir / request.mission)
 

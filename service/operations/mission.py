@@ -16,8 +16,8 @@ from hal.errors import CellError, DeviceError, InvalidRequest
 from hal.geometry import compose
 from hal.panel import PanelObject, Shown
 from perception.vision import ObjectReading, PanelWay
+from service.evaluate import AFTER
 from service.operations.acquisition import settle
-from service.operations.evaluate import AFTER
 from service.operations.find_panel import Located, locate, panel_observations, ways_of
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
 from service.operations.locate import (

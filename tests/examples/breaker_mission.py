@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.missions import with_panel
 from hal.config import load_cell
-from service.operations.evaluate import evaluate
+from service.evaluate import evaluate
 from service.operations.mission import run_mission
 from service.operations.recognise import run_recognise
 from service.operations.session import OperationContext, Session

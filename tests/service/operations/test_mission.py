@@ -17,8 +17,8 @@ from hal.config import load_cell
 from hal.errors import CellError, DeviceFault, NotFound
 from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
+from service.evaluate import evaluate
 from service.operations.acquisition import look, settle
-from service.operations.evaluate import evaluate
 from service.operations.find_panel import locate
 from service.operations.inspect import look_close
 from service.operations.locate import go_to_overview, object_depths, rims_in, scan_plate

@@ -15,11 +15,11 @@ from hal.errors import InvalidRequest
 from hal.geometry import perturbed, to_json, transform_rpy
 from hal.panel import Shown, load_panel
 from hal.simulated import ObjectTruth, Truth
-from service.operations.evaluate import AFTER, compare, evaluate, shown_of
+from service.evaluate import AFTER, compare, evaluate, shown_of
 from service.processes.connection import CellConnection
 from service.schema.mission_results import UnaskedMotion
 
-PANEL = load_panel(Path(__file__).parents[3] / "panels/bench.toml")
+PANEL = load_panel(Path(__file__).parents[2] / "panels/bench.toml")
 POSE = transform_rpy((0.95, 0.0, 0.55), (1.57, 0.0, -1.57))
 
 
@@ -170,6 +170,6 @@ def test_a_mission_is_compared_with_what_its_own_beginning_showed(
         devices_of=lambda kind: {"arm": SimpleNamespace(truth=told)},
         behind_wires_of=lambda kind: {},
     )
-    monkeypatch.setattr("service.operations.evaluate.render", lambda folder: None)
+    monkeypatch.setattr("service.evaluate.render", lambda folder: None)
     verdict = evaluate(cast(CellConnection, connection), tmp_path)
     assert asked[-1] == 80.0 and verdict.moved_unasked == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -59,9 +60,9 @@ class RealsenseOptions(WireOptions):
             return ()
         return (ResourceClaim(wire=f"realsense {self.serial or 'camera'} {self.stream_name()}"),)
 
+    @abstractmethod
     def stream_name(self) -> str:
         """Return `depth` or `color`, librealsense's names of streams."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -155,7 +155,7 @@ def test_the_image_of_a_sweep_gives_the_plane_within_its_covariance_however_late
     depth_m, view = image_from_sweep(passes, FINE, base_from_view=identity(), half_height_rad=0.45, swept_rad=0.9)
     if late_s is not None:
         assert delay_between(passes[0], passes[1], FINE, identity(), view) == pytest.approx(late_s, abs=5e-4)
-    assert np.isfinite(depth_m).mean() > 0.85
+    assert np.isfinite(depth_m).mean() > (0.9 if late_s is None else 0.85)  # late stamps cost pixels at the ends
     fit = fit_plane_near(depth_m, view, point_m=POINT_M, normal=NORMAL, sigma_offset_m=0.01, sigma_angle_rad=0.02)
     feature = fit.feature
     sigma_m = np.sqrt(NORMAL @ feature.point_covariance @ NORMAL)

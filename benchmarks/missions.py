@@ -149,7 +149,7 @@ def by_kind(runs: Sequence[Run]) -> str:
 def built_places(cell: Cell, seed: int) -> dict[str, Array]:
     """Return where the simulator builds each object of the panel with this seed: (3,) on the plate, base frame."""
     draws = Draws(seed)
-    base_from_panel = draws.panel_pose(cell.file.workspace)
+    base_from_panel = draws.panel_pose(cell.file.workspace, cell.file.simulation)
     return {
         built.panel_object.name: base_from_panel.apply([*np.add(built.panel_object.position_m, built.offset_m), 0.0])
         for built in build(cell.panel, draws)

@@ -75,6 +75,19 @@ class SimulationSection(Strict):
     """`[simulation]`: things in the simulated world that the panel file does not describe."""
 
     cables: Annotated[tuple[CableSection, ...], Field(max_length=20)] = ()
+    built_panel: Annotated[
+        str | None,
+        Field(description="panel file of the panel as built; if null, the panel is as `cell.panel` states it"),
+    ] = None
+    pad_friction: Annotated[float, Field(ge=0.05, le=2.0, description="coefficient of friction of the finger pads")] = (
+        0.8
+    )
+    panel_spread_m: Annotated[
+        float, Field(ge=0.0, le=0.5, description="largest shift of the panel along each axis, limited by the tolerance")
+    ] = 0.06
+    panel_spread_rad: Annotated[
+        float, Field(ge=0.0, le=1.0, description="largest turn of the panel, limited by the tolerance")
+    ] = 0.14
 
 
 class SafetySection(Strict):
@@ -122,6 +135,8 @@ class CellFile(Strict):
             raise ValueError("emulators need cell.mode = 'mixed' or 'sim'")
         if self.simulation.cables and self.cell.mode == "real":
             raise ValueError("simulation.cables need cell.mode = 'mixed' or 'sim'")
+        if self.simulation.built_panel is not None and self.cell.mode == "real":
+            raise ValueError("simulation.built_panel needs cell.mode = 'mixed' or 'sim'")
         return self
 
 
@@ -132,6 +147,8 @@ class Cell(Strict):
     file: CellFile
     panel: Panel
     calibrations: dict[str, CalibrationRecord]
+    built_panel: Panel | None = None
+    """The panel as the simulator builds it, where that differs from the panel file; nothing else may use it."""
 
     @property
     def name(self) -> str:
@@ -208,7 +225,28 @@ def load_cell(path: Path, *, seed: int | None = None) -> Cell:
     for device, section in file.devices.items():
         if section.mount is not None and section.mount.calibration not in records:
             records[section.mount.calibration] = _record(bare, device, section.mount.calibration)
-    return bare.model_copy(update={"calibrations": records})
+    return bare.model_copy(update={"calibrations": records, "built_panel": _built_panel(bare)})
+
+
+def _built_panel(cell: Cell) -> Panel | None:
+    """Return the panel of `simulation.built_panel`, which must have the same parts as the cell's panel."""
+    text = cell.file.simulation.built_panel
+    if text is None:
+        return None
+    built = load_panel(_locate(text, cell.path, "simulation.built_panel"))
+    if _parts(built) != _parts(cell.panel):
+        raise ConfigError(
+            f"{cell.path}: simulation.built_panel: {text!r} has other lights, tags or objects than cell.panel",
+            hint="give both files the same parts, in the same order; only their sizes, places and efforts may differ",
+            file=str(cell.path),
+            key="simulation.built_panel",
+        )
+    return built
+
+
+def _parts(panel: Panel) -> list[tuple[str, str]]:
+    objects = [(one.kind, one.name) for one in panel.objects]
+    return [*(("light", one.name) for one in panel.lights), *(("tag", one.name) for one in panel.tags), *objects]
 
 
 def _record(cell: Cell, device: str, name: str) -> CalibrationRecord:

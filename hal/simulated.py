@@ -5,6 +5,7 @@ Perception, fusion and manipulation may not import this module; import-linter se
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
@@ -42,11 +43,32 @@ class ObjectTruth:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrueContact:
+    """The forces of the arm and its tool on everything that they touched during some time.
+
+    Attributes:
+        peak_n: largest force on all things together.
+        peaks_n: largest force on each part of the panel by its name; `_plate` is the plate.
+        impulse_n_s: integral of the force over the time.
+        chatter_n: root mean square of the change of the force from tick to tick, while there was contact.
+    """
+
+    peak_n: float = 0.0
+    peaks_n: Mapping[str, float] = field(default_factory=dict)
+    impulse_n_s: float = 0.0
+    chatter_n: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """The simulator's true state, which perception, fusion, manipulation and missions cannot access."""
+    """The simulator's true state, which perception, fusion, manipulation and missions cannot access.
+
+    `initial` holds the states at the time asked for (0 is the beginning of the world), `contact` all forces since then.
+    """
 
     base_from_panel_matrix: Array  # (4, 4)
     objects: tuple[ObjectTruth, ...]
     peak_force_n: float
     sim_time_s: float
-    initial: tuple[ObjectTruth, ...] = field(default=())  # at the time asked for, 0 is the beginning of the world
+    initial: tuple[ObjectTruth, ...] = field(default=())
+    contact: TrueContact = field(default_factory=TrueContact)

@@ -10,11 +10,9 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics, MountRecord, ToolLoad
-from hal.config import WorkspaceSection
+from hal.config import SimulationSection, WorkspaceSection
 from hal.geometry import perturbed, transform_rpy
 
-PANEL_SPREAD_M = 0.06
-PANEL_SPREAD_RAD = 0.14
 FOCAL_RATIO_SIGMA = 0.0005
 CENTRE_SIGMA_PX = 0.3
 RADIAL_SIGMA = 0.002
@@ -99,10 +97,10 @@ class Draws:
             bias=tuple(float(b) for b in bias),  # type: ignore[arg-type]  # six by construction
         )
 
-    def panel_pose(self, workspace: WorkspaceSection) -> RigidTransform:
+    def panel_pose(self, workspace: WorkspaceSection, simulation: SimulationSection) -> RigidTransform:
         """Return base_from_panel, uniform around the expected pose."""
-        spread_m = min(PANEL_SPREAD_M, workspace.position_tolerance_m)
-        spread_rad = min(PANEL_SPREAD_RAD, workspace.angle_tolerance_rad)
+        spread_m = min(simulation.panel_spread_m, workspace.position_tolerance_m)
+        spread_rad = min(simulation.panel_spread_rad, workspace.angle_tolerance_rad)
         u = self.stream("panel/pose").uniform(-1.0, 1.0, 6)
         # Drawn in a cube; points beyond the limit of the cell file (the corners) are moved in to it.
         shift = spread_m * u[:3]

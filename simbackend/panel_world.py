@@ -46,24 +46,24 @@ class PanelWorld:
 
     def __init__(self, engine: Any, cell: Cell, draws: Draws, folder: Path) -> None:
         self.engine = engine
-        self.panel: Panel = cell.panel
+        self.panel: Panel = cell.built_panel or cell.panel
         self.folder = folder
-        self.base_from_panel = draws.panel_pose(cell.file.workspace)
-        self.built = {built.panel_object.name: built for built in build(cell.panel, draws)}
+        self.base_from_panel = draws.panel_pose(cell.file.workspace, cell.file.simulation)
+        self.built = {built.panel_object.name: built for built in build(self.panel, draws)}
         self.bodies: dict[str, int] = {}
         self.mechanisms: dict[str, Mechanism] = {}
-        self.lights_on = [0.0] * len(cell.panel.lights)
+        self.lights_on = [0.0] * len(self.panel.lights)
         self._first_body = engine.getNumBodies()
-        self._light_names = frozenset(light.name for light in cell.panel.lights)
+        self._light_names = frozenset(light.name for light in self.panel.lights)
         self._pictures: list[tuple[Quad, RigidTransform]] = []
         self._load_room(cell.file.workspace.floor_z_m)
         self._load_plate(draws)
-        for tag in cell.panel.tags:
-            self._print_tag(tag, cell.panel.tolerances.tag_m * draws.stream(f"tag/{tag.name}").standard_normal(2))
+        for tag in self.panel.tags:
+            self._print_tag(tag, self.panel.tolerances.tag_m * draws.stream(f"tag/{tag.name}").standard_normal(2))
         self._shines: dict[str, Shine] = {}
         self._light_places: list[tuple[float, float, float]] = []
-        for light in cell.panel.lights:
-            jitter = cell.panel.tolerances.light_m * draws.stream(f"light/{light.name}").standard_normal(3)
+        for light in self.panel.lights:
+            jitter = self.panel.tolerances.light_m * draws.stream(f"light/{light.name}").standard_normal(3)
             self._load_light(light, jitter)
         for built in self.built.values():
             self._load_object(built)
@@ -74,7 +74,7 @@ class PanelWorld:
         self.lamps_on = {name: self.built[name].start.is_on for name in self._shines}
         for name, on in self.lamps_on.items():
             self._paint_lamp(name, on=on)
-        for light in cell.panel.lights:
+        for light in self.panel.lights:
             self._paint(light.name, LIGHT_OFF, 1.0, on=False)
         self._presses = dict.fromkeys(self.mechanisms, 0)
         self._points = {

@@ -19,7 +19,6 @@ FINGER_WIDTH_M = 0.012
 FINGER_LENGTH_M = 0.075
 PAD_STIFFNESS_N_PER_M = 5_000.0  # 20 kN/m raised the lever's peak force from 71 to 114 N in the prototype
 PAD_DAMPING_N_S_PER_M = 100.0
-PAD_FRICTION = 0.8
 FINGER_MASS_KG = 0.04
 SENSOR_MASS_KG = 0.01  # the part of the sensor below its measuring element
 DARK = (0.18, 0.18, 0.20)

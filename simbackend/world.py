@@ -16,10 +16,11 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.simulated import ObjectTruth, Truth
 from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
+from simbackend.contact_log import ContactLog
 from simbackend.draws import Draws
 from simbackend.drive import ArmDrive, GripperDrive
 from simbackend.panel_world import ARM_GROUP, PANEL_GROUP, PanelWorld
-from simbackend.tool_model import PAD_DAMPING_N_S_PER_M, PAD_FRICTION, PAD_STIFFNESS_N_PER_M
+from simbackend.tool_model import PAD_DAMPING_N_S_PER_M, PAD_STIFFNESS_N_PER_M
 from simbackend.wire import (
     DOF,
     GRIPPER_AT,
@@ -53,7 +54,6 @@ class World:
         self.dt_s = 1.0 / self.cell.file.cell.control_rate_hz
         self.draws = Draws(self.cell.file.cell.seed)
         self.tick = 0
-        self.peak_force_n = 0.0
         self.pad_force_n = (0.0, 0.0)
         self.engine: Any = pybullet
         pybullet.connect(pybullet.DIRECT)
@@ -65,6 +65,7 @@ class World:
             self._load_arm(Path(folder))
             self.panel = PanelWorld(pybullet, self.cell, self.draws, Path(folder))
         self.scene = self.panel.scene
+        self._forces_on = ContactLog(self.panel.bodies, self.dt_s)
         self._ray_starts = np.repeat([mount.translation for mount in config.proximity], len(RAYS), axis=0).reshape(
             -1, 3
         )
@@ -103,7 +104,7 @@ class World:
             engine.changeDynamics(
                 self.arm,
                 finger,
-                lateralFriction=PAD_FRICTION,
+                lateralFriction=self.cell.file.simulation.pad_friction,
                 contactStiffness=PAD_STIFFNESS_N_PER_M,
                 contactDamping=PAD_DAMPING_N_S_PER_M,
             )
@@ -145,7 +146,7 @@ class World:
         for _ in range(20):
             self._advance()
         self.tick = 0
-        self.peak_force_n = 0.0
+        self._forces_on.forget()
         # The first picture loads the compiled kernel, which is better done now than during a motion.
         self.scene.draw(self.flange(), width=8, height=8, focal=(8.0, 8.0), centre=(3.5, 3.5), near_m=0.05, channels=1)
 
@@ -200,6 +201,7 @@ class World:
         self._read_contacts()
         if self.tick % PAST_TICKS == 0:
             self._past.append((self.tick, self.panel.truth()))
+            self._forces_on.end_block(self.tick)
 
     def _read_joints(self) -> None:
         engine = self.engine
@@ -214,17 +216,14 @@ class World:
         contacts = self.engine.getContactPoints(bodyA=self.arm)
         if not contacts:
             self.pad_force_n = (0.0, 0.0)
+            self._forces_on.nothing()
             return
         pads = [0.0, 0.0]
-        total = np.zeros(3)
         for contact in contacts:
-            link, force = contact[3], contact[9]
-            if link in self.fingers:
-                pads[self.fingers.index(link)] += force
-            total += force * np.asarray(contact[7])
-            total += contact[10] * np.asarray(contact[11]) + contact[12] * np.asarray(contact[13])
+            if contact[3] in self.fingers:
+                pads[self.fingers.index(contact[3])] += contact[9]
         self.pad_force_n = (pads[0], pads[1])
-        self.peak_force_n = max(self.peak_force_n, float(np.linalg.norm(total)))
+        self._forces_on.note(contacts)
 
     def snapshot(self) -> Array:
         """Return the vector whose parts `Snapshot` names."""
@@ -273,9 +272,10 @@ class World:
         return Truth(
             base_from_panel_matrix=np.asarray(self.panel.base_from_panel.as_matrix()),
             objects=self.panel.truth(),
-            peak_force_n=self.peak_force_n,
+            peak_force_n=self._forces_on.peak_n,
             sim_time_s=self.tick * self.dt_s,
             initial=self._showed(initial_s),
+            contact=self._forces_on.since(initial_s),
         )
 
     def _showed(self, time_s: float) -> tuple[ObjectTruth, ...]:

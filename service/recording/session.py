@@ -155,6 +155,7 @@ def _files(cell: Cell, calibrations: Calibrations) -> dict[str, bytes]:
     document = tomlkit.parse(cell.path.read_text(encoding="utf-8"))
     section: Any = document["cell"]
     section["panel"], section["calibrations"], section["seed"] = PANEL, CALIBRATIONS, cell.file.cell.seed
+    document.get("simulation", {}).pop("built_panel", None)  # nothing is simulated when a recording is played
     files = {PANEL: cell.panel_path.read_bytes()}
     in_use = {cell.file.devices[entry.device].mount: entry.path for entry in calibrations.all()}
     files |= {

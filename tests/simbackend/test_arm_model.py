@@ -80,7 +80,7 @@ def test_every_object_is_reached_squarely_and_off_the_wrist_singularity(cell_nam
     low, high = np.array(model.capabilities.lower_rad), np.array(model.capabilities.upper_rad)
     facing = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0, 1.0]))
     for seed in range(12):
-        base_from_panel = Draws(seed).panel_pose(cell.file.workspace)
+        base_from_panel = Draws(seed).panel_pose(cell.file.workspace, cell.file.simulation)
         for panel_object in cell.panel.objects:
             for distance_m in (0.0, 0.4):
                 panel_from_grip = RigidTransform.from_translation([*panel_object.position_m, distance_m]) * facing

@@ -26,10 +26,9 @@ RECORD = MountRecord(
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31 - 1))
 def test_the_panel_stays_within_the_cell_files_tolerance(seed: int) -> None:
-    workspace = CELL.file.workspace
-    delta = difference(
-        Draws(seed).panel_pose(workspace), transform_rpy(workspace.panel_position_m, workspace.panel_rpy_rad)
-    )
+    workspace, simulation = CELL.file.workspace, CELL.file.simulation
+    expected = transform_rpy(workspace.panel_position_m, workspace.panel_rpy_rad)
+    delta = difference(Draws(seed).panel_pose(workspace, simulation), expected)
     assert np.linalg.norm(delta[:3]) <= workspace.position_tolerance_m + 1e-9
     assert np.linalg.norm(delta[3:]) <= workspace.angle_tolerance_rad
 

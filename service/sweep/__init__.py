@@ -1,0 +1,1 @@
+"""Sweeps over random cells: draws panels, operates every control through the HTTP API, and judges by the simulator's truth."""

@@ -29,8 +29,8 @@ TOUCH_S = 2.0  # duration of hovering, approaching and leaving, without the moti
 class PoseTolerance:
     """Tolerance of a pose: standard deviations of position and angle over all axes, and the point where it applies."""
 
-    position_m: float = 0.001
-    angle_rad: float = 0.0012  # a third of a millimetre over half the width of a panel
+    position_m: float = 0.0015  # half of what the skills tolerate, so that two sigma suffice
+    angle_rad: float = 0.002  # six tenths of a millimetre over half the width of a panel
     at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def error_of(self, covariance: Array, base_from_object: RigidTransform) -> float:

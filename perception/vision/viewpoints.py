@@ -17,7 +17,9 @@ from hal.geometry import transform
 from hal.panel import Panel, PanelObject
 
 FILL = 0.85  # share of the image that the target may fill, because pose and mount are not exact
-CLOSE_UP_M = 0.30  # at a focal length of 460 px a gauge's face of 36 mm is then 110 px wide
+CLOSE_UP_M = 0.30
+READING_PX_PER_M = 1540.0  # finely enough to read every kind of instrument: a face of 72 mm is 110 px wide
+CLOSE_UP_STRETCHES = (1.0, 1.13, 1.27)  # the arm may reach only the farther poses
 SIDES = {  # rotations about the panel's x and y, in order around the object: the way across is 1.5 times as long
     "the right": (0.0, 1.0),
     "below": (1.0, 0.0),
@@ -72,12 +74,22 @@ def overview_poses(
                 yield facing(base_from_panel, (0.0, 0.0, 0.0), stretch * distance_m, tilt_rad=(tilt_x, tilt_y))
 
 
-def close_up_poses(base_from_panel: RigidTransform, point_m: Sequence[float]) -> Iterator[RigidTransform]:
-    """Yield camera poses for reading the objects around a panel point, best first."""
-    for distance_m in (CLOSE_UP_M, 0.34, 0.38):
+def reading_distance_m(intrinsics: CameraIntrinsics) -> float:
+    """Return the largest distance at which a camera resolves the panel well enough to read it, m.
+
+    It is never less than that of a close-up, because the fingers extend beyond the camera.
+    """
+    return max(CLOSE_UP_M, min(intrinsics.fx_px, intrinsics.fy_px) / READING_PX_PER_M)
+
+
+def close_up_poses(
+    base_from_panel: RigidTransform, point_m: Sequence[float], distance_m: float = CLOSE_UP_M
+) -> Iterator[RigidTransform]:
+    """Yield camera poses for reading the objects around a panel point from about a distance, best first."""
+    for stretch in CLOSE_UP_STRETCHES:
         for tilt in ((0.0, 0.0), (0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12), (0.22, 0.0), (-0.22, 0.0)):
             for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
-                yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
+                yield facing(base_from_panel, point_m, stretch * distance_m, roll_rad=roll, tilt_rad=tilt)
 
 
 def side_poses(

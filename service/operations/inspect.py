@@ -82,15 +82,16 @@ def inspect_close(session: Session, names: Collection[str]) -> Inspection:
 
 
 def close_ups(session: Session, names: Collection[str]) -> Inspection:
-    """Read objects from the fewest close-ups that show all of them."""
+    """Read objects from the fewest images that show all of them finely enough."""
     objects = [session.panel.object(name) for name in names]
-    groups = viewpoints.close_up_groups(objects, session.lens())
+    distance_m = viewpoints.reading_distance_m(session.lens())
+    groups = viewpoints.close_up_groups(objects, session.lens(), distance_m)
     groups = [groups[k] for k in visiting_order(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
     readings: dict[str, ObjectReading] = {}
     pictures: list[AnnotatedView] = []
     for k, (centre_m, group) in enumerate(groups):
         session.progress(k / len(groups), "close-up", ", ".join(group))
-        closer = look_close(session, centre_m, group)
+        closer = look_close(session, centre_m, group, distance_m=distance_m)
         readings |= closer.readings
         pictures += closer.pictures
     return Inspection(readings=readings, pictures=tuple(pictures))
@@ -103,11 +104,17 @@ def _camera_over_panel(session: Session) -> Array:
     return np.array([x, y, 0.0])
 
 
-def look_close(session: Session, centre_m: Iterable[float], names: Collection[str]) -> Inspection:
-    """Drive the camera close to a panel point and read the named objects there."""
+def look_close(
+    session: Session,
+    centre_m: Iterable[float],
+    names: Collection[str],
+    *,
+    distance_m: float = viewpoints.CLOSE_UP_M,
+) -> Inspection:
+    """Drive the camera to a distance before a panel point and read the named objects there."""
     pose = session.known_panel().parent_from_child
     title = f"close-up of {', '.join(names)}"
-    go_to_camera_view(session, viewpoints.close_up_poses(pose, tuple(centre_m)), name=title[:60])
+    go_to_camera_view(session, viewpoints.close_up_poses(pose, tuple(centre_m), distance_m), name=title[:60])
     settle(session)
     return inspect_here(session, names, title=title)
 

@@ -6,11 +6,12 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from fusion import Observation
+from fusion import Observation, PoseTolerance
 from hal.devices import DeviceKind
 from hal.errors import CellError, DeviceError, InvalidRequest
 from hal.geometry import compose
@@ -37,7 +38,7 @@ from service.operations.range_detection import (
     need_its_place,
     view_surfaces,
 )
-from service.operations.sense import feel, fuse_and_remember, fused_result
+from service.operations.sense import feel, fuse_and_remember, fused_result, pose_error
 from service.operations.session import OperationContext, Session
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
@@ -122,7 +123,8 @@ def _report(record: MissionRecord, folder: Path) -> bool:
 
 
 def _run(session: Session, record: MissionRecord, request: MissionRequest) -> None:
-    first, located, plane, by_surfaces = _find(session, record)
+    tolerance = request.wanted.tolerance()
+    found = _find(session, record, tolerance)
     with _step(session, "recognise", 0.19, 0.22) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # until the border lights are out
@@ -131,25 +133,24 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         need_all_present(overview, session)
         record.objects = _places(session, overview)
     with _step(session, "read", 0.22, 0.38) as part:
-        found = inspect_close(part, [panel_object.name for panel_object in session.panel.objects])
-        _note_pictures(record, found, "read")
-        record.readings += [reading_result(reading, BEFORE) for reading in found.readings.values()]
-        rims = rims_in(part, [view.look for view in (*overview.pictures, *found.pictures)])
+        read = inspect_close(part, [panel_object.name for panel_object in session.panel.objects])
+        _note_pictures(record, read, "read")
+        record.readings += [reading_result(reading, BEFORE) for reading in read.readings.values()]
+        rims = rims_in(part, [view.look for view in (*overview.pictures, *read.pictures)])
     with _step(session, "touch", 0.38, 0.55) as part:
-        known: tuple[Observation, ...] = (*panel_observations([first, located]), *rim_observations(rims))
-        known = known if plane is None else (*known, plane.observation)
-        felt = feel(part, request.touches, known, request.wanted.tolerance())
+        known = (*found.observations, *rim_observations(rims))
+        felt = feel(part, request.touches, known, tolerance)
     with _step(session, "fuse", 0.55, 0.57) as part:
         part.progress(0.0, "fuse rays, range plane, distances and touches")
         answer = fuse_and_remember(part, (*known, *felt.observations))
         record.fused = fused_result(answer, felt)
-        record.pictures.append(_drawing(session, located))
+        record.pictures.append(_drawing(session, found.views[-1]))
         _note_depths(part, record, rims)
     checks: list[SurfaceCheck] = []
-    if by_surfaces is not None:
+    if found.surfaces is not None:
         with _step(session, "check by surfaces", 0.57, 0.58) as part:
             part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
-            checks, pictures = check_surfaces(part, by_surfaces)
+            checks, pictures = check_surfaces(part, found.surfaces)
             record.by_surfaces = checks
             record.pictures += pictures
     _work_all(session, record, request, checks)
@@ -158,32 +159,42 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
         park(part)
 
 
-def _find(session: Session, record: MissionRecord) -> tuple[Located, Located, ScannedPlane | None, SurfaceView | None]:
-    """Find the panel twice, the second time from a square view, and scan its plate if there is a range scanner.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    """The panel from one or two views, and with a range scanner its plate and the objects with a relief."""
 
-    Returns: the panel from both views, and with a range scanner the plate and the objects with a relief.
-    """
+    views: tuple[Located, ...]
+    plane: ScannedPlane | None = None
+    surfaces: SurfaceView | None = None
+
+    @property
+    def observations(self) -> tuple[Observation, ...]:
+        rays = panel_observations(self.views)
+        return rays if self.plane is None else (*rays, self.plane.observation)
+
+
+def _find(session: Session, record: MissionRecord, tolerance: PoseTolerance) -> _Found:
+    """Find the panel and scan its plate; find it again from a square view unless its pose is as good as wanted."""
     with _step(session, "overview", 0.0, 0.06) as part:
         part.progress(0.0, "drive to the overview")
         leave_the_panel(part)
         session.world.forget()  # a mission uses only its own observations, because the panel may have been exchanged
         go_to_overview(part)
     with _step(session, "lights" if PanelWay.LIGHTS in ways_of(session) else "find the panel", 0.06, 0.10) as part:
-        first = locate(part)
-    with _step(session, "square view", 0.10, 0.16) as part:
-        part.progress(0.0, "drive to the square view")
-        go_to_overview(part)
-        located = locate(part)
-        _note_found(record, located)
-    plane: ScannedPlane | None = None
-    by_surfaces: SurfaceView | None = None
+        found = _Found(views=(locate(part),))
     if session.cell.names_of(DeviceKind.RANGE_SCANNER):
-        with _step(session, "scan", 0.16, 0.19) as part:
+        with _step(session, "scan", 0.10, 0.13) as part:
             part.progress(0.0, "scan the plate")
             plane = scan_plate(part)
             _note_plane(record, plane)
-            by_surfaces = view_surfaces(part, plane, OVERVIEW)
-    return first, located, plane, by_surfaces
+            found = replace(found, plane=plane, surfaces=view_surfaces(part, plane, OVERVIEW))
+    if pose_error(session, found.observations, tolerance) > 1.0:
+        with _step(session, "square view", 0.13, 0.19) as part:
+            part.progress(0.0, "drive to the square view")
+            go_to_overview(part)
+            found = replace(found, views=(*found.views, locate(part)))
+    _note_found(record, found.views[-1])
+    return found
 
 
 def _work_all(session: Session, record: MissionRecord, request: MissionRequest, checks: Sequence[SurfaceCheck]) -> None:

@@ -150,15 +150,15 @@ class LearnRequest(StoredLook):
 
 
 Touches = Annotated[
-    int, Field(ge=3, le=12, description="largest number of touches; fewer are made when the pose is accurate enough")
+    int, Field(ge=0, le=12, description="largest number of touches; fewer are made when the pose is accurate enough")
 ]
 
 
 class WantedPose(Strict):
     """The wanted accuracy of the panel's pose: one standard deviation over all axes. Touching ends when it is reached."""
 
-    position_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.001
-    angle_rad: Annotated[float, Field(gt=0.0, le=1.0)] = 0.0012
+    position_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.0015
+    angle_rad: Annotated[float, Field(gt=0.0, le=1.0)] = 0.002
 
     def tolerance(self) -> PoseTolerance:
         """Convert to a `fusion.PoseTolerance`."""

@@ -21,7 +21,7 @@ from service.operations import OPERATIONS, Operation, OperationContext
 from service.recording.reader import open_recording
 from service.replay.book import Book, distance, replayed_cell
 from service.replay.verdict import Verdict, differing, replay_tasks
-from service.schema.requests import MissionRequest
+from service.schema.requests import MissionRequest, WantedPose
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 from tests.service.recording import conftest, looks
@@ -181,7 +181,8 @@ def test_a_simulated_mission_is_replayed_to_the_last_bit(
         load_cell(ROOT / "cells/bench.toml", seed=11), OPERATIONS, runs_dir=tmp_path / "runs", record=path
     )
     with conftest.running(service):
-        task = service.submit("missions", MissionRequest(actions=(), touches=3))
+        wanted = WantedPose(position_m=0.0005, angle_rad=0.0005)  # so that the touches are part of the recording
+        task = service.submit("missions", MissionRequest(actions=(), touches=3, wanted=wanted))
         assert task.wait(250.0)
         assert task.state == "succeeded"
     (verdict,) = replayed(path, OPERATIONS)

@@ -107,7 +107,7 @@ def judged_mission(panelwright: Panelwright) -> tuple[list[str], str]:
     stop = client.get("/v1/stop")
     assert stop["is_latched"], "a cell with real parts starts stopped"
     client.post("/v1/stop/reset", {"seen_count": stop["count"]})
-    task = client.post("/v1/missions", {"touches": 3})
+    task = client.post("/v1/missions", {"touches": 3, "wanted": {"position_m": 0.0005, "angle_rad": 0.0005}})
     told = [json.dumps(event) for event in client.events(task["id"])]
     (mission,) = client.get("/v1/missions")["missions"]
     client.post("/v1/judge?wait_s=30", {"mission": mission["name"]})
@@ -136,3 +136,4 @@ def test_a_wire_cell_runs_the_whole_mission_and_the_judge_agrees(
     assert report["judge"]["agrees"], report["judge"]
     assert report["judge"]["readings_right"] == report["judge"]["readings_given"] > 0
     assert report["judge"]["pose_error_m"] < 0.003
+    assert len(report["fused"]["touching"]["touches"]) == 3, "three touches cannot give half a millimetre"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,13 @@ from hal.camera_model import project
 from hal.geometry import transform_rpy
 from hal.panel import load_panel
 from perception.vision.viewpoints import (
+    CLOSE_UP_M,
     SIDES,
     close_up_groups,
     facing,
     overview_distance_m,
     overview_poses,
+    reading_distance_m,
     side_poses,
 )
 
@@ -71,6 +74,14 @@ def test_the_overview_holds_the_whole_plate_wherever_it_is(slack_m: float) -> No
     pixels = project((camera.inv() * BASE_FROM_PANEL).apply(corners), LENS)
     assert np.all(pixels >= 0) and np.all(pixels <= [LENS.width_px - 1, LENS.height_px - 1])
     assert overview_distance_m(PANEL, LENS, slack_m) < 0.8
+
+
+def test_one_image_of_a_camera_with_twice_the_pixels_shows_the_whole_panel() -> None:
+    sizes = {name: 2 * getattr(LENS, name) for name in ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")}
+    finer = replace(LENS, **sizes)
+    assert reading_distance_m(LENS) == CLOSE_UP_M
+    assert reading_distance_m(finer) == pytest.approx(2 * CLOSE_UP_M, rel=0.02)
+    assert len(close_up_groups(PANEL.objects, finer, reading_distance_m(finer))) == 1
 
 
 def test_close_ups_show_every_object_once_and_whole() -> None:

@@ -112,6 +112,9 @@ def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path)
     assert honest["judge"]["agrees"] and honest["judge"]["pose_error_m"] < 0.005
     assert not planted["judge"]["agrees"] and planted["judge"]["pose_error_m"] > 0.02
     assert honest["succeeded"]
+    assert "square view" not in {step["name"] for step in honest["steps"]}, "one view and the scan give the pose"
+    assert honest["fused"]["touching"]["ended"] == "the pose is as good as wanted"
+    assert not honest["fused"]["touching"]["touches"]
     checks = {check["name"]: check for check in honest["by_surfaces"]}
     assert set(checks) == {"bypass", "emergency"}
     assert all(c["found"] and c["agrees"] and c["off_m"] < 0.004 for c in checks.values())

@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from benchmarks.range_filter_pass import geometry_of
 from benchmarks.tiled_components import _merge_seam, _scan, merge_rounds
 from hal.arrays import Array
+from hal.workers import workers_of
 from perception.range.analysis import analyse
-from perception.range.batch import IMAGES_A_TASK, _client, analyse_files, recordings_in, tasks_of
+from perception.range.batch import IMAGES_A_TASK, analyse_files, recordings_in, tasks_of
 from perception.range.fitting.surfaces import SIZE
 from perception.range.noise import estimate_noise
 from perception.range.segmentation.blocks import mean_blocks
@@ -252,7 +253,7 @@ def stamped(paths: Sequence[str]) -> TaskRun:
 
 def measured_batch(groups: list[list[str]], workers: int) -> list[TaskRun]:
     """Return the tasks of a batch run on `workers` warm local workers, in the order in which they started."""
-    with _client("local", workers) as client:
+    with workers_of("local", workers) as client:
         client.run(warm_up)
         runs: list[TaskRun] = client.gather(client.map(stamped, groups, pure=False))
     return sorted(runs, key=lambda r: r.start_s)

@@ -56,6 +56,7 @@ def _app() -> Callable[[], None]:
     from service.commands.read import read
     from service.commands.record import record, replay
     from service.commands.serve import serve
+    from service.commands.sweep import sweep
     from service.commands.teach import teach
     from service.commands.version import root
     from service.commands.warm import warm
@@ -72,6 +73,7 @@ def _app() -> Callable[[], None]:
     app.command()(demo)
     app.command()(record)
     app.command()(replay)
+    app.command()(sweep)
     app.command()(foxglove)
     app.command()(doctor)
     app.command()(check)

@@ -60,6 +60,16 @@ class JudgedDeed:
     attempts: int
     cell_s: float
 
+    @property
+    def is_right(self) -> bool:
+        """Whether it was right and said so."""
+        return self.verdict is Verdict.RIGHT
+
+    @property
+    def is_untrue(self) -> bool:
+        """Whether it was said to be done and was not, or moved what was not named."""
+        return self.verdict is Verdict.FALSE or bool(self.moved_unasked)
+
     def line(self) -> str:
         """Return the deed as one line of text."""
         extra = "".join(f"; {name} MOVED UNASKED" for name in self.moved_unasked)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import time
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +17,19 @@ import tomlkit
 from scipy.spatial.transform import RigidTransform
 
 from hal.config import Cell, load_cell
-from hal.errors import CellError
+from hal.errors import CellError, InvalidRequest
 from hal.geometry import UncertainPose, perturbed
 from hal.simulated import Truth
 from service.client import FINAL, ApiError, Client
 from service.evaluate import truth_of
 from service.serve import Options, Panelwright
-from service.sweep.deeds import Deed, deeds_of
-from service.sweep.draw import draw_panel
+from service.sweep.deeds import ROWS, Deed, deeds_of
+from service.sweep.draw import NOMINAL, draw_panel
 from service.sweep.judge import JudgedDeed, judge
 
 KNOWN_SIGMA_M, KNOWN_SIGMA_RAD = 0.00065, 0.001  # per axis: what the border lights alone give, 1.1 mm and 0.1 degrees
 WAIT_S = 20
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,11 +40,13 @@ class SweepOptions:
         cell: cell file that gives arm, sensors and workspace.
         only: kinds or rows to which the deeds are limited; empty for all.
         known_pose: whether the panel's pose is given, with the error that the border lights leave, instead of looked for.
+        inline: whether the cell is in this process, which starts faster; the answers are the same.
     """
 
     cell: Path
     only: tuple[str, ...] = ()
     known_pose: bool = False
+    inline: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,17 +60,35 @@ class PanelRun:
     wall_s: float = 0.0
 
 
+def chosen(text: str) -> tuple[str, ...]:
+    """Return the kinds and rows in a list with commas.
+
+    Raises:
+        InvalidRequest: there is no such kind or row.
+    """
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    known = (*NOMINAL, *ROWS)
+    if wrong := [name for name in names if name not in known]:
+        near = get_close_matches(wrong[0], known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+        raise InvalidRequest(f"a sweep has no control {wrong[0]!r}", hint=hint)
+    return names
+
+
 def run_panel(seed: int, options: SweepOptions, tell: Callable[[str], None] = lambda _line: None) -> PanelRun:
     """Run and judge the deeds of the panel of a seed; `tell` gets a line for each of them."""
     started_s = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="panelwright-sweep-") as folder:
         cell = load_cell(write_files(seed, options.cell, Path(folder)), seed=seed)
-        panelwright = Panelwright(cell, Options(port=0, runs_dir=Path(folder) / "runs"))
+        panelwright = Panelwright(cell, Options(port=0, runs_dir=Path(folder) / "runs", inline=options.inline))
         try:
             panelwright.start()
             done = _deeds(seed, options, cell, panelwright, tell)
         except CellError as error:
             return PanelRun(seed=seed, deeds=(), problem=f"{error.type_name}: {error.what}")
+        except Exception as defect:  # a defect on one panel must not cost the others
+            log.exception("panel %d", seed)
+            return PanelRun(seed=seed, deeds=(), problem=f"Defect: {type(defect).__name__}: {defect}")
         finally:
             panelwright.close()
     cell_s = sum(deed.cell_s for deed in done)

@@ -127,6 +127,24 @@ def test_a_cable_that_cannot_hang_is_refused(cell_path: Path, path_m: str, mode:
         load_cell(cell_path)
 
 
+def test_the_panel_as_built_has_the_parts_of_the_stated_one(cell_path: Path) -> None:
+    built = cell_path.parents[1] / "panels/built.toml"
+    cell_path.write_text(CELL + '[simulation]\nbuilt_panel = "panels/built.toml"\n')
+    built.write_text(PANEL.replace("radius_m = 0.03", "radius_m = 0.04"))
+    cell = load_cell(cell_path)
+    assert cell.built_panel is not None
+    assert (cell.built_panel.objects[0].half_footprint_m, cell.panel.objects[0].half_footprint_m) == (
+        (0.04, 0.04),
+        (0.03, 0.03),
+    )
+    built.write_text(PANEL.replace('name = "pressure"', 'name = "flow"'))
+    with pytest.raises(ConfigError, match="other lights, tags or objects"):
+        load_cell(cell_path)
+    cell_path.write_text(cell_path.read_text().replace('mode = "sim"', 'mode = "real"'))
+    with pytest.raises(ConfigError, match=r"built_panel needs cell\.mode"):
+        load_cell(cell_path)
+
+
 @pytest.mark.parametrize("lit", ["start", "pressure", "lamp_2"])
 def test_a_button_lights_lamps_only(cell_path: Path, lit: str) -> None:
     """Otherwise the object would fail only in the simulator, far from the panel file."""

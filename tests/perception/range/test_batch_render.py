@@ -146,7 +146,7 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path):
 
 @pytest.mark.slow
 def test_a_scheduler_without_workers_is_refused_in_time(folder, monkeypatch):
-    monkeypatch.setattr("perception.range.batch.LOOK_S", 0.2)
+    monkeypatch.setattr("hal.workers.LOOK_S", 0.2)
     with (
         distributed.LocalCluster(n_workers=0, dashboard_address=None, host="127.0.0.1") as cluster,
         pytest.raises(ConfigError, match="no workers"),

@@ -1,0 +1,91 @@
+"""`panelwright sweep`: operates every control of random panels, judges by the simulator's truth, and prints the tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from service.commands.common import DEFAULT_CELL, CellOption, console, find_cell
+from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
+from service.commands.warm import compile_first
+
+if TYPE_CHECKING:
+    from service.sweep.run import PanelRun
+
+
+def sweep(
+    *,
+    first: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the first panel.")] = 1,
+    panels: Annotated[int, typer.Option(min=1, help="Number of panels, of successive seeds.")] = 10,
+    cell: CellOption = DEFAULT_CELL,
+    only: Annotated[
+        str, typer.Option(help='Only these kinds or rows of the table, with commas between: "slider,wheel 720".')
+    ] = "",
+    known_pose: Annotated[
+        bool, typer.Option("--known-pose", help="Give the panel's pose with a realistic error instead of locating it.")
+    ] = False,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes of the local scheduler.")] = 1,
+    scheduler: Annotated[
+        str, typer.Option(help='Scheduler: "local", or tcp://host:port of a dask scheduler.')
+    ] = "local",
+    each: Annotated[bool, typer.Option("--each", help="Also print the deeds that were right.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for sweep.md and sweep.json.")] = Path("runs/sweep"),
+    draw: Annotated[
+        Path | None, typer.Option(help="Only write the panel and cell files into this folder, and run nothing.")
+    ] = None,
+) -> None:
+    """Operate every control of random simulated panels through the HTTP API and judge by the simulator's truth.
+
+    The exit code is 1 when a control was said to be done and was not, or when something moved that was not named.
+    """
+    from service.sweep.run import SweepOptions, chosen, write_files
+    from service.sweep.sweep import sweep as run_sweep
+    from service.sweep.sweep import write
+    from service.sweep.table import report
+
+    options = SweepOptions(cell=find_cell(cell).resolve(), only=chosen(only), known_pose=known_pose)
+    seeds = range(first, first + panels)
+    if draw is not None:
+        for seed in seeds:
+            (draw / str(seed)).mkdir(parents=True, exist_ok=True)
+            console.print(f"wrote {write_files(seed, options.cell, draw / str(seed))}", markup=False)
+        return
+    compile_first()
+    runs: list[PanelRun] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    code = 0
+    with one_interrupt(), Progress(*columns, console=console) as bar:
+        task = bar.add_task("panels", total=panels)
+
+        def note(run: PanelRun) -> None:
+            runs.append(run)
+            bar.update(task, advance=1)
+            bar.console.print(_lines(run, each=each))
+
+        try:
+            runs = run_sweep(seeds, options, scheduler=scheduler, workers=workers, progress=note)
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+    if runs:
+        console.print(report(runs), markup=False, highlight=False)
+        written = write(runs, options, out)
+        console.print("wrote " + ", ".join(str(path) for path in written), markup=False)
+    is_untrue = any(deed.is_untrue for run in runs for deed in run.deeds)
+    leave(code or (1 if is_untrue or any(run.problem for run in runs) else 0))
+
+
+def _lines(run: PanelRun, *, each: bool) -> str:
+    """Return what became of a panel: how many deeds were right, and those that were not one by one."""
+    if run.problem:
+        return f"[red]panel {run.seed}[/] {escape(run.problem)}"
+    right = sum(deed.is_right for deed in run.deeds)
+    lines = [f"panel {run.seed}: {right} of {len(run.deeds)} right, {run.cell_s:.0f} s on the cell's clock"]
+    for deed in run.deeds:
+        if each or not deed.is_right:
+            style = "red" if deed.is_untrue else "green" if deed.is_right else "yellow"
+            lines.append(f"  [{style}]{escape(deed.line())}[/]")
+    return "\n".join(lines)

@@ -16,6 +16,7 @@ from perception.vision.reading import PatchReading, doubted, gated, probability,
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.reader import Reader
+from perception.vision.status.track import track_shift
 
 SLOT = 0.2  # share of the cap's width: half of the slot plus its blur
 EDGE_BOX = 0.22  # share of the cap's length; a line across its middle is farther than this from its edges
@@ -58,7 +59,9 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
         return refused(unseen, unit=spec.scale.unit)
     least = max(LINE_NOISES * noise, LINE_SHARE * found.peak)
     line_m = _line(left, right, s, open_, near_m=found.place_m, along_m=along, least=least)
-    place = float(np.clip(found.place_m if line_m is None else line_m, lo, hi))
+    cap_m = found.place_m if line_m is None else line_m
+    track = track_shift(patch, spec, cap_m=cap_m)
+    place = float(np.clip(cap_m - track.shift_m, lo, hi))
     slope = abs(spec.scale.value_at(place + 1e-4) - spec.scale.value_at(place - 1e-4)) / 2e-4
     confidence = probability(
         [
@@ -71,7 +74,7 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     status = PatchReading(
         value=spec.scale.value_at(place),
         unit=spec.scale.unit,
-        uncertainty=slope * 0.5 / patch.image_px_per_m,
+        uncertainty=slope * float(np.hypot(0.5 / patch.image_px_per_m, track.sigma_m)),
         confidence=confidence,
     )
     return gated(status) if found.peak >= 2.0 * noise else doubted(status, unseen)

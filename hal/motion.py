@@ -64,15 +64,35 @@ class Compliance:
     max_offset_rad: float = 0.3
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GripperMotion:
+    """Move the pads while the arm holds its pose or makes a trajectory; ends when they rest or after `timeout_s`.
+
+    With `must_arrive`, it is a gripper fault if the pads hold nothing and stand still at another width.
+    """
+
+    name: str
+    width_m: float
+    force_n: float
+    speed_m_per_s: float = 0.08
+    timeout_s: float = 3.0
+    must_arrive: bool = True
+    guards: tuple[Guard, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JointTrajectory:
-    """Joint positions (N, n) rad at times (N,) s from 0, with velocities (N, n) rad/s: cubic Hermite between them."""
+    """Joint positions (N, n) rad at times (N,) s from 0, with velocities (N, n) rad/s: cubic Hermite between them.
+
+    `pads` moves the pads meanwhile; the motion ends when arm and pads have arrived. Its guards are not used.
+    """
 
     name: str
     times_s: Array
     positions_rad: Array
     velocities_rad_per_s: Array
     guards: tuple[Guard, ...] = ()
+    pads: GripperMotion | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,22 +116,6 @@ class Hold:
 
     name: str
     duration_s: float
-    guards: tuple[Guard, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GripperMotion:
-    """Move the pads while the arm holds its pose; ends when they stand still or after `timeout_s`.
-
-    With `must_arrive`, it is a gripper fault if the pads hold nothing and stand still at another width.
-    """
-
-    name: str
-    width_m: float
-    force_n: float
-    speed_m_per_s: float = 0.08
-    timeout_s: float = 3.0
-    must_arrive: bool = True
     guards: tuple[Guard, ...] = ()
 
 

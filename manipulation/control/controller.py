@@ -23,7 +23,6 @@ from hal.geometry import identity
 from hal.motion import (
     CartesianPath,
     DeclaredMotion,
-    GripperMotion,
     MotionOutcome,
     MotionReport,
     RobotState,
@@ -33,7 +32,7 @@ from manipulation.arm.kinematics import Kinematics
 from manipulation.control import braking, kernels
 from manipulation.control.control_thread import ControlThread
 from manipulation.control.drives import Drives
-from manipulation.control.executors import Executor, GripperExecutor, Tick, begin
+from manipulation.control.executors import Executor, Tick, begin
 from manipulation.control.following_error import FollowingErrorMonitor
 from manipulation.control.recorder import Recorder
 from manipulation.control.sensing import (
@@ -225,7 +224,7 @@ class Controller:
             end = Termination(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
             return self._report(motion, end, started_s, view, recorder)
         self._is_moving = True
-        self._touch_monitor.begin(moves_pads=isinstance(motion, GripperMotion))
+        self._touch_monitor.begin(moves_pads=run.pads is not None)
         self._drives.begin_rhythm()
         try:
             end = self._run(motion, run, sample, view, recorder)
@@ -269,9 +268,9 @@ class Controller:
                         over_since_s = elapsed_s if over_since_s is None else over_since_s
                         left_rad = np.abs(wanted - self._filter.last_rad)
                         if has_settled(motion, left_rad, sample.velocity_rad_per_s, elapsed_s - over_since_s):
-                            if isinstance(run, GripperExecutor):
-                                run.check_end(sample)
-                                self._touch_monitor.pads_moved(run.begun_m, sample.pads)
+                            if run.pads is not None:
+                                run.pads.check_end(sample)
+                                self._touch_monitor.pads_moved(run.pads.begun_m, sample.pads)
                             return Termination(outcome=MotionOutcome.COMPLETED, cause=cause_of_end(motion, left_rad))
                     self._send(self._filter.apply(wanted))
                     self._drives.pass_tick()
@@ -283,8 +282,8 @@ class Controller:
                     continue
             except DeviceFailure as failure:
                 end = Termination(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
-            if isinstance(run, GripperExecutor):
-                run.halt(sample, elapsed_s)
+            if run.pads is not None:
+                run.pads.halt(sample, elapsed_s)
             self._come_to_rest(end)
             return end
 

@@ -50,11 +50,17 @@ class Executor(Protocol):
         """Return whether the declared motion has run to its end."""
         ...
 
+    @property
+    def pads(self) -> GripperExecutor | None:
+        """The motion of the pads, if they move."""
+        ...
+
 
 class TrajectoryExecutor:
     """Interpolates the declared joint states by cubic Hermite polynomials, blended from the measured start."""
 
-    def __init__(self, motion: JointTrajectory, start_rad: Array) -> None:
+    def __init__(self, motion: JointTrajectory, start_rad: Array, pads: GripperExecutor | None = None) -> None:
+        self.pads = pads
         self._t = motion.times_s
         self._q, self._v = motion.positions_rad, motion.velocities_rad_per_s
         self._gap = start_rad - motion.positions_rad[0]
@@ -65,12 +71,15 @@ class TrajectoryExecutor:
         return np.asarray(q + self._gap * _fade(tick.elapsed_s))
 
     def is_over(self, tick: Tick) -> bool:
-        """Return whether the declared time has passed."""
-        return bool(tick.elapsed_s >= self._t[-1])
+        """Return whether the declared time has passed and the pads rest."""
+        rests = self.pads is None or self.pads.is_over(tick)
+        return rests and bool(tick.elapsed_s >= self._t[-1])
 
 
 class PathExecutor:
     """Follows tool poses in time; with compliance, an admittance in tool axes lets the tool yield about them."""
+
+    pads = None
 
     def __init__(self, motion: CartesianPath, kinematics: Kinematics, start_rad: Array) -> None:
         poses = motion.base_from_tool
@@ -149,6 +158,8 @@ class Admittance:
 class HoldExecutor:
     """Keeps the arm where it is."""
 
+    pads = None
+
     def __init__(self, motion: Hold) -> None:
         self._duration_s = motion.duration_s
 
@@ -167,6 +178,7 @@ class GripperExecutor:
     def __init__(self, motion: GripperMotion, gripper: Gripper, sample: Sample, clock: Clock) -> None:
         self._motion, self._gripper, self._clock = motion, gripper, clock
         self._resting_since_s: float | None = None
+        self.pads = self
         self.begun_m = sample.gripper_width_m
         self._sent_m = self._move_to(motion.width_m)
 
@@ -221,7 +233,8 @@ def begin(
     """Return the executor of a motion that starts at the measured joints of `sample`."""
     match motion:
         case JointTrajectory():
-            return TrajectoryExecutor(motion, sample.position_rad)
+            pads = None if motion.pads is None else GripperExecutor(motion.pads, gripper, sample, clock)
+            return TrajectoryExecutor(motion, sample.position_rad, pads)
         case CartesianPath():
             return PathExecutor(motion, kinematics, sample.position_rad)
         case Hold():

@@ -84,15 +84,15 @@ def check(motion: DeclaredMotion, kinematics: Kinematics, measured_rad: Array) -
     match motion:
         case JointTrajectory():
             _check_trajectory(motion, kinematics, measured_rad)
+            if motion.pads is not None:
+                _check_pads(motion.pads)
         case CartesianPath():
             _check_path(motion, kinematics, measured_rad)
         case Hold():
             if not 0.0 <= motion.duration_s <= 60.0:
                 raise _refused(motion, f"a hold of {motion.duration_s} s", "hold between 0 and 60 s")
         case GripperMotion():
-            numbers = (motion.width_m, motion.force_n, motion.speed_m_per_s, motion.timeout_s)
-            if not all(np.isfinite(n) and n >= 0.0 for n in numbers):
-                raise _refused(motion, "a number is negative or not finite", "give width, force, speed and time")
+            _check_pads(motion)
 
 
 def check_is_felt(motion: DeclaredMotion, *, has_force_torque: bool) -> None:
@@ -106,6 +106,12 @@ def check_is_felt(motion: DeclaredMotion, *, has_force_torque: bool) -> None:
         return
     what = "nothing measures the force of the contact that it makes"
     raise _refused(motion, what, "add a device of kind force_torque to the cell file")
+
+
+def _check_pads(motion: GripperMotion) -> None:
+    numbers = (motion.width_m, motion.force_n, motion.speed_m_per_s, motion.timeout_s)
+    if not all(np.isfinite(n) and n >= 0.0 for n in numbers):
+        raise _refused(motion, "a number is negative or not finite", "give width, force, speed and time")
 
 
 def _check_trajectory(motion: JointTrajectory, kin: Kinematics, measured: Array) -> None:

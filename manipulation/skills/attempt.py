@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.errors import Cancelled, DeviceFault, Stopped
+from hal.errors import Cancelled, DeviceFault, Stopped, Unreachable
 from hal.motion import (
     Compliance,
     DeclaredMotion,
@@ -72,10 +73,15 @@ class Attempt:
 
     def open_to(self, width_m: float, *, force_n: float = LET_GO_N, name: str = "set opening") -> None:
         """Move the pads to an opening while the arm holds; does nothing if closed pads are to be closed."""
+        motion = self._opening(width_m, force_n=force_n, name=name)
+        if motion is not None:
+            self.run(motion)
+
+    def _opening(self, width_m: float, *, force_n: float, name: str) -> GripperMotion | None:
         width = min(width_m, self.context.hand.max_width_m)
         if max(width, self.context.mover.state().gripper_width_m) <= CLOSED_M:
-            return
-        self.run(GripperMotion(name=name, width_m=width, force_n=force_n, speed_m_per_s=PADS_M_PER_S))
+            return None
+        return GripperMotion(name=name, width_m=width, force_n=force_n, speed_m_per_s=PADS_M_PER_S)
 
     def grasp(self, force_n: float, *, name: str) -> float:
         """Close slowly until the pads press with `force_n`; returns the opening that is left, m.
@@ -89,6 +95,21 @@ class Attempt:
         """Make a collision-free transfer; a strong contact on the way ends the attempt."""
         motion = self.context.transfer(self.joints(), goal_rad, width_m=width_m, name=name)
         self.run(motion)
+
+    def go_to_opening(self, goal_rad: Array, *, width_m: float, name: str) -> None:
+        """Make a collision-free transfer, and set the opening on the way where there is room for the wider hand."""
+        pads = self._opening(width_m, force_n=LET_GO_N, name="set opening")
+        if pads is None:
+            self.go_to(goal_rad, width_m=width_m, name=name)
+            return
+        widest_m = max(pads.width_m, self.context.mover.state().gripper_width_m)
+        try:
+            motion = self.context.transfer(self.joints(), goal_rad, width_m=widest_m, name=name)
+        except Unreachable:
+            self.run(pads)
+            self.go_to(goal_rad, width_m=width_m, name=name)
+            return
+        self.run(replace(motion, pads=pads))
 
     def straight(
         self,
@@ -150,7 +171,6 @@ class Attempt:
             options: for each stroke its panel_from_grip poses, the first at the standoff.
         """
         index, path = self.context.choose(options, near_rad=self.joints(), width_m=width_m, may_touch=may_touch)
-        self.open_to(width_m)
-        self.go_to(path[0], width_m=width_m, name=f"to {name}")
+        self.go_to_opening(path[0], width_m=width_m, name=f"to {name}")
         self.context.mover.tare()
         return index

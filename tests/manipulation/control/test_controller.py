@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -230,6 +231,7 @@ def test_set_points_never_break_the_limits_even_when_a_path_asks_for_it(rig: Rig
         joints(HOME + 1.0, duration_s=0.1),
         Hold(name="long", duration_s=float("nan")),
         GripperMotion(name="wide", width_m=-1.0, force_n=1.0),
+        replace(joints(HOME), pads=GripperMotion(name="wide", width_m=-1.0, force_n=1.0)),
         CartesianPath(name="empty", flange_from_tool=GRIP, times_s=np.array([0.0]), base_from_tool=(tool_pose(HOME),)),
     ],
     ids=lambda motion: motion.name,
@@ -262,6 +264,18 @@ def test_the_gripper_moves_while_the_arm_holds(rig: Rig) -> None:
     assert report.outcome is MotionOutcome.COMPLETED
     assert report.gripper_width_m == pytest.approx(0.01, abs=1e-4)
     assert np.allclose(rig.world.q, HOME)
+
+
+@pytest.mark.parametrize("last", ["arm", "pads"])
+def test_the_pads_move_during_a_trajectory_and_both_arrive(rig: Rig, last: str) -> None:
+    goal = HOME + np.array([0.2, -0.1, 0.1, 0.3, -0.2, 0.4]) * (1.0 if last == "arm" else 0.1)
+    pads = GripperMotion(name="close", width_m=0.01, force_n=10.0)
+    motion = joints(goal, duration_s=1.5 if last == "arm" else 0.2)
+    report = rig.controller.execute(replace(motion, pads=pads))
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert report.gripper_width_m == pytest.approx(0.01, abs=1e-4)
+    assert np.abs(report.position_rad - goal).max() < 1e-3
+    assert (report.duration_s > motion.times_s[-1] + 0.1) == (last == "pads")
 
 
 @pytest.mark.parametrize("ticks", [0, 3, 100])

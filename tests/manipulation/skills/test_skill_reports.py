@@ -9,9 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.errors import MotionError
+from hal.errors import MotionError, Unreachable
 from hal.geometry import certain, transform_rpy
-from hal.motion import CartesianPath, DeclaredMotion, MotionLog, MotionOutcome, MotionReport, RobotState
+from hal.motion import (
+    CartesianPath,
+    DeclaredMotion,
+    JointTrajectory,
+    MotionLog,
+    MotionOutcome,
+    MotionReport,
+    RobotState,
+)
 from hal.panel import load_panel
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.hand import Hand
@@ -204,6 +212,31 @@ def test_closed_pads_that_shall_be_closed_are_left_alone(width_m: float, wanted_
     mover.state = lambda: state  # type: ignore[method-assign]  # one state for this test
     Attempt(context).open_to(wanted_m)
     assert mover.asked.count("set opening") == moves
+
+
+def test_pads_open_on_the_way_and_before_it_where_the_wider_hand_has_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    context, mover = before_the_bench({})
+    goal_rad = context.park_rad
+    Attempt(context).go_to_opening(goal_rad, width_m=0.03, name="to there")
+    (motion,) = mover.motions
+    assert isinstance(motion, JointTrajectory) and motion.pads is not None
+    assert motion.pads.width_m == 0.03
+
+    plan, widths_m = SkillContext.transfer, []
+
+    def narrow(self: SkillContext, *joints_rad: Any, width_m: float, **more: Any) -> JointTrajectory:
+        widths_m.append(width_m)
+        if width_m > 0.01:
+            raise Unreachable("no room", hint="close the hand")
+        return plan(self, *joints_rad, width_m=width_m, **more)
+
+    monkeypatch.setattr(SkillContext, "transfer", narrow)
+    mover.motions.clear()
+    state = replace(mover.state(), gripper_width_m=0.03)
+    mover.state = lambda: state  # type: ignore[method-assign]  # one state for this test
+    Attempt(context).go_to_opening(goal_rad, width_m=0.01, name="to there")
+    assert [motion.name for motion in mover.motions] == ["set opening", "to there"]
+    assert widths_m == [0.03, 0.01]
 
 
 def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:

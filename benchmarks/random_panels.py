@@ -24,9 +24,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
     parser.add_argument("--only", default="")
     parser.add_argument("--known-pose", action="store_true")
+    parser.add_argument("--mission", action="store_true")
     given = parser.parse_args(arguments)
     only = tuple(filter(None, given.only.split(",")))
-    options = SweepOptions(cell=given.cell.resolve(), only=only, known_pose=given.known_pose)
+    options = SweepOptions(cell=given.cell.resolve(), only=only, known_pose=given.known_pose, mission=given.mission)
     runs = []
     for seed in range(given.first, given.last + 1):
         runs.append(run_panel(seed, options, tell=lambda line: print(line, flush=True)))

@@ -14,7 +14,7 @@ from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.warm import compile_first
 
 if TYPE_CHECKING:
-    from service.sweep.run import PanelRun
+    from service.sweep.ask import PanelRun
 
 
 def sweep(
@@ -27,6 +27,9 @@ def sweep(
     ] = "",
     known_pose: Annotated[
         bool, typer.Option("--known-pose", help="Give the panel's pose with a realistic error instead of locating it.")
+    ] = False,
+    mission: Annotated[
+        bool, typer.Option("--mission", help="Order all deeds of a panel in one mission, with readings.")
     ] = False,
     workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes of the local scheduler.")] = 1,
     scheduler: Annotated[
@@ -47,7 +50,7 @@ def sweep(
     from service.sweep.sweep import write
     from service.sweep.table import report
 
-    options = SweepOptions(cell=find_cell(cell).resolve(), only=chosen(only), known_pose=known_pose)
+    options = SweepOptions(cell=find_cell(cell).resolve(), only=chosen(only), known_pose=known_pose, mission=mission)
     seeds = range(first, first + panels)
     if draw is not None:
         for seed in seeds:

@@ -81,10 +81,19 @@ class JudgedDeed:
         )
 
 
-def judge(seed: int, deed: Deed, panel: Panel, answer: Mapping[str, Any], truth: Truth) -> JudgedDeed:
+def judge(
+    seed: int,
+    deed: Deed,
+    panel: Panel,
+    answer: Mapping[str, Any],
+    truth: Truth,
+    *,
+    worked: frozenset[str] = frozenset(),
+) -> JudgedDeed:
     """Judge a deed.
 
     Args:
+        worked: parts that other deeds of the same time were about.
         panel: the panel as built.
         answer: `outcome`, `cause`, `confirmed`, `attempts`, `peak_force_n` of the report.
         truth: with the states before the deed as `initial`.
@@ -92,6 +101,7 @@ def judge(seed: int, deed: Deed, panel: Panel, answer: Mapping[str, Any], truth:
     one = panel.object(deed.object)
     before = {item.name: item for item in truth.initial}
     after = {item.name: item for item in truth.objects}
+    worked |= {one.name, one.shown_by}
     reached = is_reached(one, deed.goal, after)
     verdict = verdict_of(deed, str(answer["outcome"]), reached=reached, is_said=bool(answer["confirmed"]))
     return JudgedDeed(
@@ -108,12 +118,12 @@ def judge(seed: int, deed: Deed, panel: Panel, answer: Mapping[str, Any], truth:
         else is_true_cause(str(answer["outcome"]), one, deed, before=before, after=after, peak_n=truth.contact.peak_n),
         before=_text(before[one.shown_by]),
         after=_text(after[one.shown_by]),
-        moved_unasked=_moved(one, panel, before, after),
+        moved_unasked=_moved(worked, panel, before, after),
         touched_unasked=tuple(
             sorted(
                 name
                 for name, peak_n in truth.contact.peaks_n.items()
-                if peak_n > TOUCHED_N and name not in (one.name, "_plate")
+                if peak_n > TOUCHED_N and name not in worked | {"_plate"}
             )
         ),
         peak_n=truth.contact.peak_n,
@@ -178,14 +188,13 @@ def has_moved(one: PanelObject, was: ObjectTruth, now: ObjectTruth) -> bool:
 
 
 def _moved(
-    worked: PanelObject, panel: Panel, before: Mapping[str, ObjectTruth], after: Mapping[str, ObjectTruth]
+    worked: frozenset[str], panel: Panel, before: Mapping[str, ObjectTruth], after: Mapping[str, ObjectTruth]
 ) -> tuple[str, ...]:
     """Return the objects that changed although neither they nor a control that they belong to was operated."""
     return tuple(
         name
         for name, was in before.items()
-        if name not in (worked.name, worked.shown_by)
-        and not panel.object(name).is_right(shown_of(was), shown_of(after[name]))
+        if name not in worked and not panel.object(name).is_right(shown_of(was), shown_of(after[name]))
     )
 
 

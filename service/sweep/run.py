@@ -7,28 +7,19 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import tomlkit
-from scipy.spatial.transform import RigidTransform
 
-from hal.config import Cell, load_cell
+from hal.config import load_cell
 from hal.errors import CellError, InvalidRequest
-from hal.geometry import UncertainPose, perturbed
-from hal.simulated import Truth
-from service.client import FINAL, ApiError, Client
-from service.evaluate import truth_of
 from service.serve import Options, Panelwright
-from service.sweep.deeds import ROWS, Deed, deeds_of
+from service.sweep.ask import PanelRun, asked_of
+from service.sweep.deeds import ROWS, Deed
 from service.sweep.draw import NOMINAL, draw_panel
-from service.sweep.judge import JudgedDeed, judge
 
-KNOWN_SIGMA_M, KNOWN_SIGMA_RAD = 0.00065, 0.001  # per axis: what the border lights alone give, 1.1 mm and 0.1 degrees
-WAIT_S = 20
 log = logging.getLogger(__name__)
 
 
@@ -40,6 +31,7 @@ class SweepOptions:
         cell: cell file that gives arm, sensors and workspace.
         only: kinds or rows to which the deeds are limited; empty for all.
         known_pose: whether the panel's pose is given, with the error that the border lights leave, instead of looked for.
+        mission: whether all deeds are ordered in one mission, instead of one after the other.
         inline: whether the cell is in this process, which starts faster; the answers are the same.
     """
 
@@ -47,17 +39,11 @@ class SweepOptions:
     only: tuple[str, ...] = ()
     known_pose: bool = False
     inline: bool = False
+    mission: bool = False
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PanelRun:
-    """The judged deeds of one panel; `problem` says why there are none."""
-
-    seed: int
-    deeds: tuple[JudgedDeed, ...]
-    problem: str = ""
-    cell_s: float = 0.0
-    wall_s: float = 0.0
+    def wants(self, deed: Deed) -> bool:
+        """Return whether the sweep is about this deed."""
+        return not self.only or deed.kind in self.only or deed.row in self.only
 
 
 def chosen(text: str) -> tuple[str, ...]:
@@ -83,7 +69,8 @@ def run_panel(seed: int, options: SweepOptions, tell: Callable[[str], None] = la
         panelwright = Panelwright(cell, Options(port=0, runs_dir=Path(folder) / "runs", inline=options.inline))
         try:
             panelwright.start()
-            done = _deeds(seed, options, cell, panelwright, tell)
+            asked = asked_of(panelwright, seed, known_pose=options.known_pose, is_wanted=options.wants)
+            done = asked.in_one_mission() if options.mission else asked.one_by_one(tell)
         except CellError as error:
             return PanelRun(seed=seed, deeds=(), problem=f"{error.type_name}: {error.what}")
         except Exception as defect:  # a defect on one panel must not cost the others
@@ -91,8 +78,7 @@ def run_panel(seed: int, options: SweepOptions, tell: Callable[[str], None] = la
             return PanelRun(seed=seed, deeds=(), problem=f"Defect: {type(defect).__name__}: {defect}")
         finally:
             panelwright.close()
-    cell_s = sum(deed.cell_s for deed in done)
-    return PanelRun(seed=seed, deeds=tuple(done), cell_s=cell_s, wall_s=time.monotonic() - started_s)
+    return replace(done, wall_s=time.monotonic() - started_s)
 
 
 def write_files(seed: int, base: Path, folder: Path) -> Path:
@@ -112,62 +98,3 @@ def write_files(seed: int, base: Path, folder: Path) -> Path:
     path = folder / "cell.toml"
     path.write_text(tomlkit.dumps(table), encoding="utf-8")
     return path
-
-
-def _deeds(
-    seed: int, options: SweepOptions, cell: Cell, panelwright: Panelwright, tell: Callable[[str], None]
-) -> list[JudgedDeed]:
-    client = Client(url=panelwright.url, timeout_s=120.0, is_lasting=False)
-    first = _truth(panelwright)
-    if options.known_pose:
-        panelwright.service.world.believe_panel(_nearly(first, seed))
-    assert cell.built_panel is not None  # noqa: S101 - narrowing: `write_files` states it
-    judged = []
-    for deed in deeds_of(seed, cell.built_panel, {item.name: item for item in first.objects}):
-        if options.only and deed.kind not in options.only and deed.row not in options.only:
-            continue
-        began_s = _truth(panelwright).sim_time_s
-        answer = _asked(client, deed)
-        truth = _truth(panelwright, began_s)
-        answer["cell_s"] = truth.sim_time_s - began_s
-        judged.append(judge(seed, deed, cell.built_panel, answer, truth))
-        tell(judged[-1].line())
-    return judged
-
-
-def _truth(panelwright: Panelwright, began_s: float | None = None) -> Truth:
-    """Return the truth, with the states at a simulated time (by default now) as `initial`."""
-    connection = panelwright.service.supervisor.connection
-    now = truth_of(connection, 0.0)
-    return now if began_s is None else truth_of(connection, now.sim_time_s - began_s)
-
-
-def _nearly(truth: Truth, seed: int) -> UncertainPose:
-    """Return the true pose of the panel with the error of a good measurement."""
-    sigma = np.array([KNOWN_SIGMA_M] * 3 + [KNOWN_SIGMA_RAD] * 3)
-    error = sigma * np.random.default_rng([seed, 1]).standard_normal(6)
-    true = RigidTransform.from_matrix(truth.base_from_panel_matrix)
-    return UncertainPose(parent_from_child=perturbed(true, error), covariance=np.diag(sigma**2))
-
-
-def _asked(client: Client, deed: Deed) -> dict[str, Any]:
-    """Ask for a deed and wait for its end; returns what the report says."""
-    nothing = {"confirmed": False, "attempts": 0, "peak_force_n": 0.0}
-    try:
-        stop = client.get("/v1/stop")
-        if stop["is_latched"]:
-            client.post("/v1/stop/reset", {"seen_count": stop["count"]})
-        task = client.post("/v1/manipulate", deed.body)
-        while task["state"] not in FINAL:
-            task = client.get(f"/v1/tasks/{task['id']}?wait_s={WAIT_S}")
-    except ApiError as error:
-        return {**nothing, "outcome": _type_of(error.problem), "cause": error.what}
-    if task["result"] is None:
-        problem = task["problem"] or {"type": task["state"], "detail": ""}
-        return {**nothing, "outcome": _type_of(problem), "cause": problem["detail"]}
-    action = task["result"]["action"]
-    return {**action, "cause": action["detail"]}
-
-
-def _type_of(problem: dict[str, Any]) -> str:
-    return str(problem.get("type", "problem")).rsplit(":", 1)[-1]

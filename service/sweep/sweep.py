@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from hal.workers import as_they_end, workers_of
-from service.sweep.run import PanelRun, SweepOptions, run_panel
+from service.sweep.ask import PanelRun
+from service.sweep.run import SweepOptions, run_panel
 from service.sweep.table import report
 
 RETRIES = 1  # of a panel whose worker died

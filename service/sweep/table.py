@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from service.sweep.ask import PanelRun
 from service.sweep.deeds import ROWS
 from service.sweep.judge import JudgedDeed, Verdict
-from service.sweep.run import PanelRun
 
 Z_95 = 1.96
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
@@ -25,7 +25,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     centre = p + z * z / (2 * trials)
     spread = z * float(np.sqrt(p * (1 - p) / trials + z * z / (4 * trials * trials)))
     whole = 1 + z * z / trials
-    return (centre - spread) / whole, (centre + spread) / whole
+    return max(0.0, (centre - spread) / whole), min(1.0, (centre + spread) / whole)
 
 
 def report(runs: Sequence[PanelRun]) -> str:
@@ -99,6 +99,8 @@ def totals(runs: Sequence[PanelRun]) -> str:
     ]
     if times := [run.cell_s for run in runs if run.deeds]:
         lines.append(f"- a panel on the cell's clock, median: {np.median(times):.1f} s")
+    if given := sum(run.readings[1] for run in runs):
+        lines.append(f"- readings right: {sum(run.readings[0] for run in runs)} of {given}")
     lines += [f"- seed {run.seed}: {run.problem}" for run in runs if run.problem]
     return "\n".join(lines)
 

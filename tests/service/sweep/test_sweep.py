@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 from hal.config import load_cell
 from hal.errors import InvalidRequest
 from service.cli import _app
-from service.sweep.run import PanelRun, SweepOptions, chosen, run_panel
+from service.sweep.ask import PanelRun
+from service.sweep.run import SweepOptions, chosen, run_panel
 from service.sweep.sweep import hash_of, sweep
 
 BENCH = Path(__file__).parents[3] / "cells/bench.toml"

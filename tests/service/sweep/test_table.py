@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 from scipy.stats import binomtest
 
+from service.sweep.ask import PanelRun
 from service.sweep.judge import JudgedDeed, Verdict
-from service.sweep.run import PanelRun, SweepOptions
+from service.sweep.run import SweepOptions
 from service.sweep.sweep import hash_of, write
 from service.sweep.table import report, wilson
 

@@ -68,7 +68,8 @@ class Compliance:
 class GripperMotion:
     """Move the pads while the arm holds its pose or makes a trajectory; ends when they rest or after `timeout_s`.
 
-    With `must_arrive`, it is a gripper fault if the pads hold nothing and stand still at another width.
+    With `must_arrive`, it is a gripper fault if the pads hold nothing and stand still at another width. With
+    `is_retreat`, a sensor other than the gripper that fails does not end the motion.
     """
 
     name: str
@@ -78,6 +79,7 @@ class GripperMotion:
     timeout_s: float = 3.0
     must_arrive: bool = True
     guards: tuple[Guard, ...] = ()
+    is_retreat: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,6 +87,7 @@ class JointTrajectory:
     """Joint positions (N, n) rad at times (N,) s from 0, with velocities (N, n) rad/s: cubic Hermite between them.
 
     `pads` moves the pads meanwhile; the motion ends when arm and pads have arrived. Its guards are not used.
+    With `is_retreat`, a sensor that fails does not end the motion; see `CartesianPath`.
     """
 
     name: str
@@ -93,6 +96,7 @@ class JointTrajectory:
     velocities_rad_per_s: Array
     guards: tuple[Guard, ...] = ()
     pads: GripperMotion | None = None
+    is_retreat: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,6 +104,10 @@ class CartesianPath:
     """Tool poses at times (N,) s from 0; between neighbours a straight line and a rotation at constant rate.
 
     The first pose must be where the tool is (within 5 mm and 0.05 rad): the executor blends from the measured pose.
+
+    With `is_retreat`, the path leads away from what the hand may touch. It needs the arm only: a force, touch, gripper or
+    proximity sensor that fails does not end it, the report's `cause` names that sensor, and a wrench that is not
+    measured counts as zero.
     """
 
     name: str
@@ -108,6 +116,7 @@ class CartesianPath:
     base_from_tool: tuple[RigidTransform, ...]
     guards: tuple[Guard, ...] = ()
     compliance: Compliance | None = None
+    is_retreat: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,8 +46,14 @@ from manipulation.control.sensing import (
     ToolView,
     refuse,
 )
-from manipulation.control.setpoint import SetPointLimiter, check, check_is_felt, flange_matrix
-from manipulation.control.termination import Termination, TerminationMonitor, cause_of_end, has_settled
+from manipulation.control.setpoint import SetPointLimiter, check, check_is_felt, flange_matrix, is_retreat
+from manipulation.control.termination import (
+    Termination,
+    TerminationMonitor,
+    cause_of_end,
+    force_limit_n,
+    has_settled,
+)
 from manipulation.plausibility.hand import TouchMonitor
 from manipulation.plausibility.repetition import RepeatedWrench
 
@@ -92,9 +98,10 @@ class Controller:
             ),
             clock=clock,
             max_age_s=safety.max_reading_age_s,
+            repeated_wrench=RepeatedWrench(devices.force_torque),
         )
-        self._repeated_wrench = RepeatedWrench(devices.force_torque)
         self._touch_monitor = TouchMonitor(devices.touch, devices.force_torque)
+        self._is_retreat = False  # whether the running motion goes on when a sensor fails
         capabilities = devices.arm.capabilities()
         self.kinematics = Kinematics.of(capabilities)
         self._clock = clock
@@ -196,7 +203,7 @@ class Controller:
 
     def _refresh(self) -> Sample:
         try:
-            self._newest = self._read()
+            self._newest = self._read(is_tolerant=True)
         except DeviceFailure as failure:
             if self._newest is None:
                 raise DeviceFault(str(failure), hint="run `panelwright devices`", device=failure.device) from failure
@@ -213,7 +220,7 @@ class Controller:
         recorder = Recorder(self._dt_s)
         view = ToolView(self.kinematics.dh, self._contact, tool)
         try:
-            sample = self._read()
+            sample = self._read(is_tolerant=is_retreat(motion))
             self._standing.check_held(sample.position_rad, self._filter)
             check(motion, self.kinematics, sample.position_rad)
             self._filter = SetPointLimiter(self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s)
@@ -223,13 +230,13 @@ class Controller:
             self._standing.give_up(failure.device)
             end = Termination(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
             return self._report(motion, end, started_s, view, recorder)
-        self._is_moving = True
+        self._is_moving, self._is_retreat = True, is_retreat(motion)
         self._touch_monitor.begin(moves_pads=run.pads is not None)
         self._drives.begin_rhythm()
         try:
             end = self._run(motion, run, sample, view, recorder)
         finally:
-            self._is_moving = False
+            self._is_moving = self._is_retreat = False
         return self._report(motion, end, started_s, view, recorder)
 
     def _begin(self, motion: DeclaredMotion, sample: Sample) -> Executor:
@@ -246,7 +253,7 @@ class Controller:
         look = view.look(sample, self._filter.last_rad)
         watch = TerminationMonitor(
             motion.guards,
-            self._safety.force_limit_n,
+            force_limit_n(motion, self._safety.force_limit_n),
             look,
             arm=self._devices.arm.name,
             is_latched=self._is_latched,
@@ -303,7 +310,7 @@ class Controller:
             self._drives.switch_off()
         self._standing.give_up(end.device)
         with suppress(DeviceFailure):
-            self._newest = self._read()
+            self._newest = self._read(is_tolerant=True)
 
     def _tare(self) -> Array:
         if self._is_latched():
@@ -328,17 +335,20 @@ class Controller:
 
     # -- small steps -----------------------------------------------------------------------------------------------
 
-    def _read(self, before: Sample | None = None) -> Sample:
+    def _read(self, before: Sample | None = None, *, is_tolerant: bool = False) -> Sample:
+        """Read the devices; in a retreat, or if tolerant, sensors may fail once there has been a sample."""
+        without = self._newest if is_tolerant or self._is_retreat else None
         try:
-            sample = self._devices.read(before)
-            refuse(self._repeated_wrench.note(sample.raw_wrench, stamp_s=sample.stamp_s))
+            sample = self._devices.read(before, without=without)
         except DeviceFailure as failure:
             self._faults = self._faults or (str(failure),)  # a reader of the state sees that it is old
             raise
-        self._faults = ()
+        self._faults = (self._faults or tuple(map(str, sample.unheard))) if sample.unheard else ()
         return sample
 
     def _check_touch(self, sample: Sample, look: ToolReading) -> None:
+        if self._is_retreat:
+            return
         tip_m = look.base_from_tool[:3, 3]
         refuse(self._touch_monitor.note(sample.contacts, look.wrench, tip_m, stamp_s=sample.stamp_s))
 
@@ -358,7 +368,7 @@ class Controller:
             name=motion.name,
             outcome=end.outcome,
             tripped=end.tripped,
-            cause=end.cause,
+            cause="; ".join((end.cause, *(f"without {one}" for one in self._faults if is_retreat(motion)))),
             started_s=started_s,
             ended_s=self._clock.now_s(),
             position_rad=q,
@@ -377,7 +387,7 @@ class Controller:
             position_rad=sample.position_rad,
             velocity_rad_per_s=sample.velocity_rad_per_s,
             base_from_flange=RigidTransform.from_matrix(flange),
-            wrench=self._contact.in_flange(sample.raw_wrench, flange),
+            wrench=self._contact.in_flange(sample.raw_wrench, flange) if sample.is_felt else np.zeros(6),
             contacts=sample.contacts,
             proximity_m=sample.proximity_m,
             gripper_width_m=sample.gripper_width_m,

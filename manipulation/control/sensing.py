@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from hal.readings import Cause, Quality, Stamped
 from manipulation.control import kernels
 from manipulation.plausibility.finding import Finding
 from manipulation.plausibility.hand import Pads
+from manipulation.plausibility.repetition import RepeatedWrench
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -34,7 +35,10 @@ COMMAND_WAIT_S = 0.25  # for commands sent over a slow bus once per motion, not 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sample:
-    """The readings of one tick; `raw_wrench` (6,) is in sensor axes and still contains bias and weight."""
+    """The readings of one tick; `raw_wrench` (6,) is in sensor axes and still contains bias and weight.
+
+    `unheard` gives the failures that a retreat tolerates, and `is_felt` is False when the wrench is one of them.
+    """
 
     stamp_s: float
     position_rad: Array
@@ -45,6 +49,9 @@ class Sample:
     gripper_width_m: float
     gripper_is_moving: bool
     gripper_is_holding: bool = False
+    is_felt: bool = True
+    unheard: tuple[DeviceFailure, ...] = ()
+    slow_unheard: tuple[DeviceFailure, ...] = ()  # of the sensors that are read every fourth tick
 
     @property
     def pads(self) -> Pads:
@@ -146,12 +153,16 @@ class Devices:
     proximities: Sequence[RangeReader]
     clock: Clock
     max_age_s: float
+    repeated_wrench: RepeatedWrench = field(default_factory=lambda: RepeatedWrench(None))
 
-    def read(self, before: Sample | None = None) -> Sample:
+    def read(self, before: Sample | None = None, *, without: Sample | None = None) -> Sample:
         """Read the devices once; with the sample `before`, gripper and proximity are taken over from it.
 
         Gripper and proximity sensors are slow: the caller reads them every fourth tick, which leaves time for the
         others.
+
+        Args:
+            without: the readings that take the place of those of sensors that fail; with None a failure is raised.
 
         Raises:
             DeviceFailure: the first device that is silent, broken, stale or invalid. "Nothing in range" is a valid
@@ -160,21 +171,28 @@ class Devices:
         joints = self._joints()
         now_s = self.clock.now_s()
         deadline = Deadline(now_s + read_wait_s(self.clock), self.clock)
-        raw = np.zeros(6)
-        if self.force_torque is not None:
-            wrench = self._ask(self.force_torque.name, self.force_torque.read_wrench, now_s, deadline)
-            raw[:3], raw[3:] = wrench.force_n, wrench.torque_nm
-            _check_finite(self.force_torque.name, raw)
-        contacts: tuple[bool, ...] = ()
-        if self.touch is not None:
-            contacts = self._ask(self.touch.name, self.touch.read_contacts, now_s, deadline)
+        unheard: list[DeviceFailure] = []
+        slow_unheard: list[DeviceFailure] = [] if before is None else [*before.slow_unheard]
+
+        def ask(read: Callable[[], T], otherwise: T, failed: list[DeviceFailure] = unheard) -> T:
+            try:
+                return read()
+            except DeviceFailure as failure:
+                if without is None:
+                    raise
+                failed.append(failure)
+                return otherwise
+
+        raw = ask(lambda: self._raw_wrench(now_s, deadline), np.zeros(6))
+        is_felt = not unheard
+        untouched: tuple[bool, ...] = ()
+        contacts = ask(lambda: self._contacts(now_s, deadline), untouched)
         if before is None:
-            grip = self._ask(self.gripper.name, self.gripper.read_state, now_s, deadline)
-            width_m, is_moving, is_holding = grip.width_m, grip.is_moving, grip.is_holding
-            seen = self._ranges_m(now_s)
+            last_pads, last_seen = (Pads(width_m=0.0), ()) if without is None else (without.pads, without.proximity_m)
+            pads = ask(lambda: self._pads(now_s, deadline), last_pads, slow_unheard)
+            seen = ask(lambda: self._ranges_m(now_s), last_seen, slow_unheard)
         else:
-            width_m, is_moving = before.gripper_width_m, before.gripper_is_moving
-            is_holding, seen = before.gripper_is_holding, before.proximity_m
+            pads, seen = before.pads, before.proximity_m
         _check_finite(self.arm.name, joints.position_rad)
         return Sample(
             stamp_s=now_s,
@@ -183,10 +201,30 @@ class Devices:
             raw_wrench=raw,
             contacts=contacts,
             proximity_m=seen,
-            gripper_width_m=width_m,
-            gripper_is_moving=is_moving,
-            gripper_is_holding=is_holding,
+            gripper_width_m=pads.width_m,
+            gripper_is_moving=pads.is_moving,
+            gripper_is_holding=pads.is_holding,
+            is_felt=is_felt,
+            unheard=(*unheard, *slow_unheard),
+            slow_unheard=tuple(slow_unheard),
         )
+
+    def _raw_wrench(self, now_s: float, deadline: Deadline) -> Array:
+        """Return the raw wrench (6,); zero in a cell that does not measure it."""
+        raw = np.zeros(6)
+        if self.force_torque is not None:
+            wrench = self._ask(self.force_torque.name, self.force_torque.read_wrench, now_s, deadline)
+            raw[:3], raw[3:] = wrench.force_n, wrench.torque_nm
+            _check_finite(self.force_torque.name, raw)
+            refuse(self.repeated_wrench.note(raw, stamp_s=now_s))
+        return raw
+
+    def _contacts(self, now_s: float, deadline: Deadline) -> tuple[bool, ...]:
+        return () if self.touch is None else self._ask(self.touch.name, self.touch.read_contacts, now_s, deadline)
+
+    def _pads(self, now_s: float, deadline: Deadline) -> Pads:
+        grip = self._ask(self.gripper.name, self.gripper.read_state, now_s, deadline)
+        return Pads(width_m=grip.width_m, is_moving=grip.is_moving, is_holding=grip.is_holding)
 
     def _joints(self) -> JointState:
         """Return the arm's newest state; on a wall clock, wait a moment if it is old.
@@ -308,5 +346,7 @@ class ToolView:
             contact.centre_m,
             GRAVITY_M_PER_S2,
         )
+        if not sample.is_felt:
+            now = np.zeros(6)
         before, self._before = self._before, now
         return ToolReading(pose, tip, now if before is None else 0.5 * (now + before))

@@ -95,14 +95,25 @@ def check(motion: DeclaredMotion, kinematics: Kinematics, measured_rad: Array) -
             _check_pads(motion)
 
 
+def is_retreat(motion: DeclaredMotion) -> bool:
+    """Return whether the motion goes on when a sensor fails."""
+    return not isinstance(motion, Hold) and motion.is_retreat
+
+
 def check_is_felt(motion: DeclaredMotion, *, has_force_torque: bool) -> None:
     """Refuse a motion that ends or yields by contact forces in a cell that does not measure them.
+
+    A retreat is not refused, because it ends a contact.
 
     Raises:
         MotionRefused: the motion watches a force, or is compliant, and there is no force/torque sensor.
     """
     is_compliant = isinstance(motion, CartesianPath) and motion.compliance is not None
-    if has_force_torque or not (is_compliant or any(guard.quantity in BY_CONTACT for guard in motion.guards)):
+    if (
+        has_force_torque
+        or is_retreat(motion)
+        or not (is_compliant or any(guard.quantity in BY_CONTACT for guard in motion.guards))
+    ):
         return
     what = "nothing measures the force of the contact that it makes"
     raise _refused(motion, what, "add a device of kind force_torque to the cell file")

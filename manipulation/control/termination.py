@@ -15,6 +15,8 @@ from manipulation.plausibility.arm import FOLLOWING_LIMIT_M
 
 TRACKING_TICKS = 5
 LOADED_START_RATIO = 1.2  # a motion that starts under load gets this higher limit, so that a jammed hand can be freed
+# A transfer touches nothing, and the hand's inertia shows at most 4 N in it. The force goes on rising while the arm stops.
+TRANSFER_FORCE_N = 30.0
 RAN = "ran to its declared end"
 SETTLE_S = 0.3
 CATCH_UP_S = 2.0  # additional time for a set-point that speed limits have delayed
@@ -100,6 +102,11 @@ class TerminationMonitor:
                 side = "at most" if guard.below else "at least"
                 cause = f"guard {guard.name}: {guard.quantity} {side} {guard.limit:g} {UNITS[guard.quantity]}"
         return Termination(outcome=outcome, cause=cause, tripped=guard.name, device=device)
+
+
+def force_limit_n(motion: DeclaredMotion, cell_limit_n: float) -> float:
+    """Return the largest contact force of a motion: the cell's own limit, or less in a transfer through free space."""
+    return min(cell_limit_n, TRANSFER_FORCE_N) if isinstance(motion, JointTrajectory) else cell_limit_n
 
 
 def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -106,6 +108,29 @@ def test_a_defect_of_a_driver_stops_the_arm_as_gently_as_a_failing_device(rig: R
     assert report.device == device and "ZeroDivisionError" in report.cause
     assert rig.world.ticks < 300 + 120
     assert np.abs(rig.world.velocity).max() < 1e-3
+
+
+@pytest.mark.parametrize("device", ["gripper", "wrist_ft", "finger_touch", "proximity_left"])
+@pytest.mark.parametrize("how", ["silent", "frozen"])
+def test_a_retreat_needs_the_arm_only_and_names_the_sensor_that_it_goes_without(
+    rig: Rig, device: str, how: str
+) -> None:
+    rig.controller.execute(Hold(name="first", duration_s=0.02))
+    getattr(rig.world, how).add(device)
+    rig.controller.execute(Hold(name="age", duration_s=0.2))
+    begun_m = rig.world.tip()[0, 3]
+    report = rig.controller.execute(replace(forwards(-0.05), is_retreat=True))
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert device in report.cause
+    assert rig.world.tip()[0, 3] == pytest.approx(begun_m - 0.05, abs=1e-3)
+    assert device in rig.controller.state().faults[0], "the fault stays named"
+
+
+def test_a_retreat_ends_when_the_arm_itself_fails(rig: Rig) -> None:
+    rig.controller.execute(Hold(name="first", duration_s=0.02))
+    rig.world.silent.add("arm")
+    report = rig.controller.execute(replace(forwards(-0.05), is_retreat=True))
+    assert report.outcome is MotionOutcome.FAULT and report.device == "arm"
 
 
 def test_a_device_that_is_dead_before_the_start_moves_nothing(rig: Rig) -> None:

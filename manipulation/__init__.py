@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from manipulation.skills.operate import operate
     from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
-    from manipulation.skills.retreat import park
+    from manipulation.skills.retreat import free_hand, park, step_back
     from manipulation.skills.sweep import plan_sweep
     from manipulation.skills.travel import back_out_of, plan_to_first, plan_to_joints, reachable, stands_clear
     from manipulation.warm import warm_up
@@ -36,6 +36,7 @@ __all__ = [
     "SpeedLimits",
     "Verify",
     "back_out_of",
+    "free_hand",
     "is_in_reach",
     "operate",
     "park",
@@ -46,6 +47,7 @@ __all__ = [
     "proximity_probe",
     "reachable",
     "stands_clear",
+    "step_back",
     "touch_points",
     "touch_probe",
     "visiting_order",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
@@ -40,6 +41,7 @@ class Attempt:
     def __init__(self, context: SkillContext) -> None:
         self.context = context
         self.reports: list[MotionReport] = []
+        self.is_stopped_in_transfer = False
 
     def run(self, motion: DeclaredMotion) -> MotionReport:
         """Execute a motion; returns when it completed or one of its own guards ended it.
@@ -94,7 +96,9 @@ class Attempt:
     def go_to(self, goal_rad: Array, *, width_m: float, name: str) -> None:
         """Make a collision-free transfer; a strong contact on the way ends the attempt."""
         motion = self.context.transfer(self.joints(), goal_rad, width_m=width_m, name=name)
+        self.is_stopped_in_transfer = True
         self.run(motion)
+        self.is_stopped_in_transfer = False
 
     def go_to_opening(self, goal_rad: Array, *, width_m: float, name: str) -> None:
         """Make a collision-free transfer, and set the opening on the way where there is room for the wider hand."""
@@ -154,8 +158,15 @@ class Attempt:
         return self.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=(guard,))
 
     def leave(self, distance_m: float = RETREAT_M) -> None:
-        """Move back along the fingers."""
-        self.advance(-distance_m, name="retreat", speed_m_per_s=RETREAT_M_PER_S, stop_n=FREE_N)
+        """Move back along the fingers.
+
+        Raises:
+            SkillFailure: something held the hand, which the caller then frees (`unverified`: the stroke itself ended).
+        """
+        back = self.advance(-distance_m, name="retreat", speed_m_per_s=RETREAT_M_PER_S, stop_n=FREE_N)
+        if back.tripped is not None:
+            force_n = float(np.linalg.norm(back.wrench[:3]))
+            raise SkillFailure(Outcome.UNVERIFIED, f"the stroke ended as declared, but {force_n:.0f} N held the hand")
 
     def begin(
         self,

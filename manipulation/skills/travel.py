@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.errors import Unreachable
+from hal.errors import MotionError, Stopped, Unreachable
 from hal.motion import JointTrajectory
 from manipulation.planning.collision import CollisionModel
 from manipulation.planning.shapes import CollisionBox
@@ -107,7 +107,12 @@ def back_out_of(context: SkillContext, room: CollisionBox) -> None:
         Unreachable: the arm did not get out.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    retreat(context)
+    try:
+        retreat(context)
+    except Stopped:
+        raise
+    except MotionError:
+        pass  # the steps below show whether the hand came free
     attempt = Attempt(context)
     for _ in range(MOST_STEPS_BACK):
         if stands_clear(context, room):

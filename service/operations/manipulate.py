@@ -5,15 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hal.config import Cell
+from hal.devices import DeviceKind
 from hal.entry_points import registered
-from hal.errors import InvalidRequest, PerceptionError, Unreachable
+from hal.errors import (
+    CellError,
+    DeviceError,
+    InvalidRequest,
+    MotionError,
+    PerceptionError,
+    Stopped,
+    Unreachable,
+)
 from hal.panel import PanelObject
 from hal.panel.kinds import SKILLS, has_part
-from manipulation import ObjectState, SkillReport, Verify, operate
+from manipulation import ObjectState, SkillReport, Verify, free_hand, operate
 from perception.vision import ObjectReading, said
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.session import Session
-from service.operations.travel import skill_context
+from service.operations.travel import park, skill_context
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.schema.mission_results import ActionResult, ManipulateResult
@@ -40,6 +49,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     """
     panel_object = session.panel.object(body.object)
     target = target_of(panel_object, body)
+    free_hand(skill_context(session))
     eye = _Eye(session, panel_object, verify)
     before = eye.before()
     current = None if before is None else object_state(before, eye.witness)
@@ -106,11 +116,28 @@ def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateRe
     """Run the verb `manipulate`."""
     ensure_located(session.part(0.0, 0.3))
     session.progress(0.3, f"work {request.object}")
-    deed = work(session.part(0.3, 1.0), request, verify=request.verify)
+    try:
+        deed = work(session.part(0.3, 1.0), request, verify=request.verify)
+    except (DeviceError, MotionError) as error:
+        _leave_after(session, error)
+        raise
     pictures = []
     if deed.picture is not None:
         pictures.append(session.context.task.artefact("after.png", deed.picture.png, "image/png"))
     return ManipulateResult(action=deed.action, pictures=pictures)
+
+
+def _leave_after(session: Session, error: CellError) -> None:
+    """Park the arm after an error of a deed, and add to the error why it could not be parked.
+
+    An arm that has failed itself is not moved, and neither is one that was stopped.
+    """
+    if isinstance(error, Stopped) or error.details.get("device") in session.cell.names_of(DeviceKind.ARM):
+        return
+    try:
+        park(session)
+    except CellError as second:
+        error.details["not_parked"] = second.what
 
 
 class _Eye:

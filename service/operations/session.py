@@ -128,7 +128,7 @@ class Session:
         """
         report = self.mover.execute(motion)
         if report.outcome not in expect:
-            raise self._failure(report)
+            raise self.failure(report)
         return report
 
     def note(self, report: MotionReport) -> None:
@@ -206,7 +206,8 @@ class Session:
         """Return the newest estimate of the panel's pose, or the pose that the cell file expects."""
         return self.world.base_from_panel or expected_panel(self.cell)
 
-    def _failure(self, report: MotionReport) -> Exception:
+    def failure(self, report: MotionReport) -> Exception:
+        """Return the error for a motion that ended otherwise than wanted."""
         self.context.task.check_cancelled()
         what = f"motion {report.name!r} ended as {report.outcome}: {report.cause}"
         match report.outcome:

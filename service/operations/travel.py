@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.geometry import transform_rpy
-from hal.motion import MotionReport
+from hal.motion import JointTrajectory, MotionOutcome, MotionReport
 from manipulation import (
     CollisionBox,
     Kinematics,
@@ -20,6 +20,7 @@ from manipulation import (
     plan_to_first,
     plan_to_joints,
     stands_clear,
+    step_back,
 )
 from manipulation import park as park_arm
 from manipulation import reachable as reachable_poses
@@ -52,7 +53,7 @@ def go_to_first(
         thorough=thorough,
         between=session.context.task.check_cancelled,
     )
-    return session.run(way)
+    return _drive(session, way)
 
 
 def reachable(session: Session, base_from_flange: Sequence[RigidTransform]) -> list[int]:
@@ -64,8 +65,18 @@ def go_to_joints(session: Session, goal_rad: Array, *, name: str) -> bool:
     """Drive to a joint vector; returns False, and moves nothing, when there is no free path."""
     way = plan_to_joints(skill_context(session), goal_rad, name=name)
     if way is not None:
-        session.run(way)
+        _drive(session, way)
     return way is not None
+
+
+def _drive(session: Session, way: JointTrajectory) -> MotionReport:
+    """Execute a transfer; after a contact, go a little way back along it, and raise."""
+    report = session.run(way, expect=(MotionOutcome.COMPLETED, MotionOutcome.FAULT))
+    if report.outcome is MotionOutcome.COMPLETED:
+        return report
+    if report.device is None:
+        step_back(skill_context(session), report)
+    raise session.failure(report)
 
 
 def park(session: Session) -> None:

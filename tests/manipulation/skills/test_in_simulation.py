@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ import pytest
 from benchmarks.manipulation import SKILLS
 from benchmarks.simcell import SimBench, open_bench
 from hal.errors import DeviceFault, Stopped
+from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault
+from manipulation.skills.operate import operate
 from manipulation.skills.outcome import Outcome
 from manipulation.skills.probe import touch_probe
 from manipulation.skills.retreat import park
@@ -60,10 +64,27 @@ def test_a_stop_in_the_middle_is_raised_and_the_arm_rests(bench: SimBench) -> No
     assert np.abs(bench.context.mover.state().velocity_rad_per_s).max() < 0.01
 
 
-def test_a_dead_wrist_sensor_ends_the_deed_with_its_name(bench: SimBench) -> None:
-    bench.devices["wrist_ft"].inject_fault(Fault.SILENT)
+@pytest.mark.parametrize("device", ["wrist_ft", "finger_touch", "gripper"])
+def test_a_sensor_that_dies_in_the_stroke_is_named_and_the_arm_parks_without_it(bench: SimBench, device: str) -> None:
+    def die() -> None:
+        bench.devices[device].inject_fault(Fault.SILENT)
+
+    class Mover:
+        """Lets the sensor die 0.2 s after the press has begun."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(bench.controller, name)
+
+        def execute(self, motion: DeclaredMotion) -> MotionReport:
+            if motion.name == "press":
+                bench.shared.peek("world").at(bench.clock.now_s() + 0.2, die)
+            return bench.controller.execute(motion)
+
+    context = replace(bench.context, mover=Mover())
     with pytest.raises(DeviceFault) as caught:
-        bench.operate("pump", "on")
-    bench.devices["wrist_ft"].inject_fault(None)
-    assert caught.value.details["device"] == "wrist_ft"
-    park(bench.context)
+        operate(context, context.panel.object("start"), "on")
+    assert caught.value.details["device"] == device
+    park(context)
+    bench.devices[device].inject_fault(None)
+    assert np.abs(bench.context.mover.state().position_rad - bench.context.park_rad).max() < 0.01
+    assert bench.peak_force_n() < 100.0

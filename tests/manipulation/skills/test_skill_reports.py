@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -259,8 +260,22 @@ def test_a_hand_that_is_held_is_pulled_again() -> None:
     held = replace(COMPLETED, outcome=MotionOutcome.GUARD, tripped="contact")
     for answer, pulls in ((held, PULLS), (COMPLETED, 1)):
         context, mover = before_the_bench({"retreat": answer})
-        retreat(context)
+        with pytest.raises(MotionError, match="did not come free") if pulls == PULLS else nullcontext():
+            retreat(context)
         assert mover.asked.count("retreat") == pulls
+
+
+def test_a_hand_that_is_held_when_the_stroke_has_ended_is_freed_before_anything_else() -> None:
+    held = replace(COMPLETED, outcome=MotionOutcome.GUARD, tripped="contact")
+    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
+    answers = iter([held])  # the first retreat is held, the pulls of the freeing are not
+    execute = mover.execute
+    mover.execute = lambda motion: (  # type: ignore[method-assign]
+        next(answers, execute(motion)) if motion.name == "retreat" else execute(motion)
+    )
+    told = press(context, "start", "on", verify=lambda: ObjectState(name="start", state="on"))
+    assert told.is_done
+    assert [name for name in mover.asked if name in ("press", "let go", "retreat")][-2:] == ["let go", "retreat"]
 
 
 def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_no_defect() -> None:

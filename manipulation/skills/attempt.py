@@ -15,6 +15,7 @@ from hal.motion import (
     DeclaredMotion,
     GripperMotion,
     Guard,
+    JointTrajectory,
     MotionOutcome,
     MotionReport,
     Quantity,
@@ -96,6 +97,9 @@ class Attempt:
     def go_to(self, goal_rad: Array, *, width_m: float, name: str) -> None:
         """Make a collision-free transfer; a strong contact on the way ends the attempt."""
         motion = self.context.transfer(self.joints(), goal_rad, width_m=width_m, name=name)
+        self._run_transfer(motion)
+
+    def _run_transfer(self, motion: JointTrajectory) -> None:
         self.is_stopped_in_transfer = True
         self.run(motion)
         self.is_stopped_in_transfer = False
@@ -113,7 +117,7 @@ class Attempt:
             self.run(pads)
             self.go_to(goal_rad, width_m=width_m, name=name)
             return
-        self.run(replace(motion, pads=pads))
+        self._run_transfer(replace(motion, pads=pads))
 
     def straight(
         self,

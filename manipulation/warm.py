@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from manipulation.arm import branches
 from manipulation.arm import kernels as arm_kernels
 from manipulation.control import braking, kernels
-from manipulation.planning import clearance
+from manipulation.planning import clearance, timing_kernels
 
 
 def warm_up() -> None:
-    """Run every compiled function of kinematics, control and clearance once, on an arm of six joints and one box."""
+    """Run every compiled function of kinematics, control, clearance and timing once, on an arm of six joints and one box."""
     dh, q = np.zeros((6, 4)), np.full(6, 0.1)
     dh[:, 1] = 0.2
     kernels.warm(dh)
     braking.warm(dh)
     arm_kernels.tool_and_jacobian(dh, q, np.eye(4))
+    arm_kernels.rotation_log(np.eye(3))
+    branches.warm(dh)
+    timing_kernels.warm(dh)
     tool_ends, radii = np.zeros((1, 2, 3)), np.full(7, 0.01)
     box = (np.eye(3)[None], np.full((1, 3), 2.0), np.full((1, 3), 0.1))
     watched, pairs = np.ones((7, 1), bool), np.array([[0, 3]])

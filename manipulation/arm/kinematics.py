@@ -13,23 +13,29 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.devices import ArmCapabilities
-from hal.errors import Unreachable
-from manipulation.arm import kernels
+from hal.errors import ConfigError, Unreachable
+from manipulation.arm import branches, kernels
+from manipulation.arm.branches import whole_turns
 
-RESIDUAL = 1e-6  # EAIK answers an unreachable pose by least squares; forward kinematics shows the difference
 LARGEST_STEP_RAD = 0.35  # between neighbouring samples of a stroke; a larger step is another branch
-TURN_RAD = 2.0 * np.pi
+SOLVED_JOINTS = 6  # the solver takes a chain of six; the joints beyond it are free to choose
+FREE_JOINT_SAMPLES = 16  # values of a free joint that are tried
+MOST_STARTS = 40  # of a stroke, nearest first; an arm of six joints has at most 16
+RISE_S = 0.03  # time in which a joint may change its acceleration from 0 to the limit
 SINGULAR_RATIO = 0.02  # smallest singular value of the scaled Jacobian; strokes fail below this
+BY_LENGTH = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])[:, None]  # scales lengths by 0.5 m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Kinematics:
-    """Forward and inverse kinematics of a six-joint arm.
+    """Forward and inverse kinematics of an arm of six joints, or of seven, the last of which is a turn of the wrist.
+
+    A joint vector of seven is one of six for a flange that is turned back by the seventh joint. The seventh is sampled.
 
     Attributes:
         dh: (n, 4) rows (d, a, alpha, offset), m and rad.
-        lower_rad, upper_rad, velocity_rad_per_s, acceleration_rad_per_s2: (n,) limits.
-        solver: the EAIK robot.
+        lower_rad, upper_rad, velocity_rad_per_s, acceleration_rad_per_s2, jerk_rad_per_s3: (n,) limits.
+        solver: the EAIK robot of the first six joints.
     """
 
     capabilities: ArmCapabilities
@@ -38,12 +44,23 @@ class Kinematics:
     upper_rad: Array
     velocity_rad_per_s: Array
     acceleration_rad_per_s2: Array
+    jerk_rad_per_s3: Array
     solver: Any
 
     @classmethod
     def of(cls, capabilities: ArmCapabilities) -> Kinematics:
-        """Build the kinematics from the arm's capabilities."""
+        """Build the kinematics from the arm's capabilities.
+
+        Raises:
+            ConfigError: the arm has other than six or seven joints, or no closed solution is known for the first six.
+        """
         dh = np.array([[link.d_m, link.a_m, link.alpha_rad, link.offset_rad] for link in capabilities.links])
+        solver = DhRobot(dh[:SOLVED_JOINTS, 2], dh[:SOLVED_JOINTS, 1], dh[:SOLVED_JOINTS, 0])
+        if len(dh) not in (SOLVED_JOINTS, SOLVED_JOINTS + 1) or not solver.hasKnownDecomposition():
+            raise ConfigError(
+                f"arm {capabilities.model!r}: no closed inverse kinematics for its {len(dh)} joints",
+                hint="use an arm of six joints with a known solution, or of seven whose first six have one",
+            )
         return cls(
             capabilities=capabilities,
             dh=dh,
@@ -51,7 +68,8 @@ class Kinematics:
             upper_rad=np.array(capabilities.upper_rad),
             velocity_rad_per_s=np.array(capabilities.velocity_rad_per_s),
             acceleration_rad_per_s2=np.array(capabilities.acceleration_rad_per_s2),
-            solver=DhRobot(dh[:, 2], dh[:, 1], dh[:, 0]),
+            jerk_rad_per_s3=np.array(capabilities.acceleration_rad_per_s2) / RISE_S,
+            solver=solver,
         )
 
     def flange(self, q_rad: Array) -> RigidTransform:
@@ -72,17 +90,26 @@ class Kinematics:
 
         Source: Elsner et al., EAIK, 2025 (subproblem decomposition); each solution is checked by forward kinematics.
         """
-        turned = [_turned(q[None], self.lower_rad, self.upper_rad)[:, 0] for q in self._branches(base_from_flange)]
-        return np.concatenate([np.empty((0, len(self.dh))), *turned])
+        found: Array = branches.all_turns(self._branches(base_from_flange.as_matrix()), self.lower_rad, self.upper_rad)
+        return found
 
-    def _branches(self, base_from_flange: RigidTransform) -> Array:
-        """Return the joint vectors (k, n) that reach the pose, each joint up to whole turns."""
-        goal = base_from_flange.as_matrix()
-        found = np.atleast_2d(np.asarray(self.solver.IK(goal).Q, float))
-        if found.size == 0:
-            return np.empty((0, len(self.dh)))
-        found = found[np.all(np.isfinite(found), axis=1)] - self.dh[:, 3]
-        return found[[np.abs(kernels.frames(self.dh, q)[-1] - goal).max() < RESIDUAL for q in found]]
+    def _branches(self, goal: Array) -> Array:
+        """Return the joint vectors (k, n) that reach the pose (4, 4), each joint up to whole turns."""
+        if len(self.dh) == SOLVED_JOINTS:
+            return self._solved(goal)
+        some = []
+        for free in np.linspace(self.lower_rad[-1], self.upper_rad[-1], FREE_JOINT_SAMPLES):
+            turn_back = np.linalg.inv(kernels.frames(self.dh[SOLVED_JOINTS:], np.array([free]))[-1])
+            six = self._solved(goal @ turn_back)
+            some.append(np.column_stack([six, np.full(len(six), free)]))
+        return np.concatenate(some)
+
+    def _solved(self, goal: Array) -> Array:
+        """Return the branches (k, 6) of the first six joints for the pose (4, 4) of the frame after them."""
+        dh = self.dh[:SOLVED_JOINTS]
+        found = np.ascontiguousarray(self.solver.IK(goal).Q, float).reshape(-1, SOLVED_JOINTS)
+        exact: Array = branches.exact_branches(dh, found - dh[:, 3], np.ascontiguousarray(goal))
+        return exact
 
     def follow(self, base_from_flange: Sequence[RigidTransform], *, near_rad: Array) -> tuple[Array, ...]:
         """Return the joint paths (N, n) that follow *all* poses without a jump, limit or singularity; best first.
@@ -97,17 +124,17 @@ class Kinematics:
         Raises:
             Unreachable: no branch follows all poses; names the pose at which the longest one stops.
         """
-        branches = [self._branches(pose) for pose in base_from_flange]
+        poses = np.array([pose.as_matrix() for pose in base_from_flange])
         ranked: list[tuple[float, Array]] = []
         furthest = 0
-        for q in branches[0]:
-            path = _unwound(q, branches[1:])
+        for q in self._starts(poses[0], near_rad):
+            path = branches.followed(self.dh, q, poses, LARGEST_STEP_RAD)
             within = int(np.count_nonzero(_fits(path, self.lower_rad, self.upper_rad)))
-            furthest = max(furthest, min(within, len(branches) - 1))
-            if within == len(branches) and self._is_regular(path):
+            furthest = max(furthest, min(within, len(poses) - 1))
+            if within == len(poses) and self._is_regular(path):
                 poor = min(self.conditioning(path[0]), self.conditioning(path[-1]))
-                turned = _turned(path, self.lower_rad, self.upper_rad)
-                ranked += [(self._effort(turn, near_rad, poor), turn) for turn in turned]
+                turns = whole_turns(path.min(axis=0), path.max(axis=0), self.lower_rad, self.upper_rad)
+                ranked += [(self._effort(path + turn, near_rad, poor), path + turn) for turn in turns]
         if not ranked:
             where = base_from_flange[furthest].translation
             raise Unreachable(
@@ -117,14 +144,22 @@ class Kinematics:
             )
         return tuple(path for _, path in sorted(ranked, key=lambda pair: pair[0]))
 
+    def _starts(self, pose: Array, near_rad: Array) -> Array:
+        """Return the branches (k, n) of a stroke's first pose that can be inside the limits, nearest first."""
+        found = self._branches(pose)
+        found = found[[bool(_fits(q[None], self.lower_rad, self.upper_rad)[0]) for q in found]]
+        if len(found) <= MOST_STARTS:
+            return found
+        travel = np.abs((found - near_rad + np.pi) % branches.TURN_RAD - np.pi) / self.velocity_rad_per_s
+        return np.asarray(found[np.argsort(travel.max(axis=1), kind="stable")[:MOST_STARTS]])
+
     def _is_regular(self, path: Array) -> bool:
         return min(self.conditioning(q) for q in path[:: max(1, len(path) // 8)]) >= SINGULAR_RATIO
 
     def conditioning(self, q_rad: Array) -> float:
         """Return the smallest singular value of the flange Jacobian, lengths scaled by 0.5 m; 0 at a singularity."""
-        scale = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])[:, None]
         _, jacobian = kernels.tool_and_jacobian(self.dh, q_rad, np.eye(4))
-        return float(np.linalg.svd(scale * jacobian, compute_uv=False)[-1])
+        return float(np.linalg.svd(BY_LENGTH * jacobian, compute_uv=False)[-1])
 
     def _effort(self, path: Array, near_rad: Array, poor: float) -> float:
         # Seconds to get there, plus a penalty for ending near a limit or a singularity.
@@ -133,34 +168,8 @@ class Kinematics:
         return float(travel + 0.05 / (margin + 0.02) + 0.05 / (poor + 0.02))
 
 
-def _unwound(start: Array, branches: Sequence[Array]) -> Array:
-    """Return the path (m, n) from `start` through the nearest solution of each pose, up to the first jump."""
-    path = [start]
-    for options in branches:
-        steps = (options - path[-1] + np.pi) % TURN_RAD - np.pi
-        lengths = np.abs(steps).max(axis=1, initial=0.0)
-        if len(steps) == 0 or lengths.min() > LARGEST_STEP_RAD:
-            break
-        path.append(path[-1] + steps[np.argmin(lengths)])
-    return np.array(path)
-
-
 def _fits(path: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
     """Return (m,) for each point of a path whether whole turns can bring the path up to there inside the limits."""
     low, high = np.minimum.accumulate(path), np.maximum.accumulate(path)
-    return np.asarray((high + _least_turns(low, lower) <= upper + 1e-12).all(axis=1))
-
-
-def _turned(path: Array, lower: Array, upper: Array) -> Array:
-    """Return all paths (k, m, n) inside the limits that equal this one (m, n) up to whole turns of single joints."""
-    first = _least_turns(path.min(axis=0), lower)
-    choices = [
-        np.arange(least, limit - highest + 1e-12, TURN_RAD)
-        for least, highest, limit in zip(first, path.max(axis=0), upper, strict=True)
-    ]
-    turns = np.stack(np.meshgrid(*choices, indexing="ij"), axis=-1).reshape(-1, 1, path.shape[1])
-    return np.asarray(path + turns)
-
-
-def _least_turns(lowest: Array, lower: Array) -> Array:
-    return np.asarray(TURN_RAD * np.ceil((lower - lowest) / TURN_RAD - 1e-12))
+    turns = branches.TURN_RAD * np.ceil((lower - low) / branches.TURN_RAD - 1e-12)
+    return np.asarray((high + turns <= upper + 1e-12).all(axis=1))

@@ -1,4 +1,4 @@
-"""Two arms for tests, and slow reference implementations in plain numpy."""
+"""Three arms for tests, and slow reference implementations in plain numpy."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ PI = np.pi
 def _arm(
     model: str, rows: list[tuple[float, float, float, float]], limit: float, radii: tuple[float, ...]
 ) -> ArmCapabilities:
+    count = len(rows)
     return ArmCapabilities(
         model=model,
         links=tuple(DhLink(d_m=d, a_m=a, alpha_rad=alpha, offset_rad=offset) for d, a, alpha, offset in rows),
-        lower_rad=(-limit,) * 6,
-        upper_rad=(limit,) * 6,
-        velocity_rad_per_s=(1.6, 1.6, 1.6, 3.2, 3.2, 3.2),
-        acceleration_rad_per_s2=(8.0, 8.0, 8.0, 16.0, 16.0, 16.0),
+        lower_rad=(-limit,) * count,
+        upper_rad=(limit,) * count,
+        velocity_rad_per_s=(1.6, 1.6, 1.6, 3.2, 3.2, 3.2, 3.2)[:count],
+        acceleration_rad_per_s2=(8.0, 8.0, 8.0, 16.0, 16.0, 16.0, 16.0)[:count],
         tip_speed_m_per_s=1.0,
         command_rate_hz=500.0,
         link_radius_m=radii,
@@ -50,6 +51,20 @@ UR = _arm(
     ],
     2 * PI,
     (0.09, 0.07, 0.06, 0.05, 0.05, 0.05),
+)
+SEVEN = _arm(
+    "seven-test",
+    [
+        (0.34, 0.0, -PI / 2, 0.0),
+        (0.0, 0.0, PI / 2, 0.0),
+        (0.40, 0.05, PI / 2, 0.0),
+        (0.0, -0.05, -PI / 2, 0.0),
+        (0.40, 0.0, PI / 2, 0.0),
+        (0.0, 0.09, PI / 2, 0.0),
+        (0.11, 0.0, 0.0, 0.0),
+    ],
+    2.9,
+    (0.09, 0.07, 0.07, 0.06, 0.06, 0.05, 0.05),
 )
 
 

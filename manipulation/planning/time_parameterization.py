@@ -1,10 +1,12 @@
-"""Converts a joint path to a trajectory within the limits of joints and tip.
+"""Converts a joint path to a trajectory within the limits of speed, acceleration and jerk of each joint, and of the tip.
 
-The path q(s) is sampled on a grid with rounded corners. Then the speed ds/dt is made as high as the limits allow by one
-pass forwards and one backwards over the samples.
+The highest speed along the path within speeds and accelerations is found by a pass backwards and one forwards. Its mean
+over a short time turns each step of the acceleration into a ramp. Then the demand of every tick is measured; where
+it exceeds a limit, the speed is lowered on that part of the path, and the passes are repeated. In the end time is
+stretched by what is left, so that every tick is within the limits.
 
-Source: Bobrow, Dubowsky and Gibson, IJRR 4(3), 1985, in the grid form of Pham and Pham, IEEE T-RO 34(3), 2018, with the
-acceleration limit split in half between the two terms of q'' = q_s s'' + q_ss s'^2.
+Source: Pham and Pham, IEEE T-RO 34(3), 2018, for the passes; the mean in time is that of Biagiotti and Melchiorri,
+Control Engineering Practice 20(8), 2012.
 """
 
 from __future__ import annotations
@@ -17,10 +19,19 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.motion import Guard, JointTrajectory
-from manipulation.arm import kernels
 from manipulation.arm.kinematics import Kinematics
+from manipulation.planning import timing_kernels
+from manipulation.planning.smooth_path import SmoothPath
 
-SAMPLE_RAD = 0.02  # spacing of the timing grid along the path
+SAMPLE_RAD = 0.01  # spacing of the timing grid along the path
+SAMPLES_PER_REACH = 4  # the spacing is smaller where a corner is tight
+LEAST_SAMPLES, MOST_SAMPLES = 60, 3000
+ROUNDS = 8
+GOOD_ENOUGH = 1.003  # a stretch of time that is not worth another round
+CURE = 1.6  # power of the excess by which the squared speed is lowered; neighbouring ticks lower the same part again
+# The mean is taken over these multiples of the time in which the acceleration may rise to its limit. Twice the time allows
+# a change from full acceleration to full deceleration at once; less ends a simple move earlier.
+RISES = (1.0, 1.4, 2.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,72 +39,103 @@ class SpeedLimits:
     """Speed limits of a transfer: fractions of the joint limits, and the speed of the tool's tip."""
 
     tip_m_per_s: float
-    joint_ratio: float = 0.5
-    acceleration_ratio: float = 0.5
+    joint_ratio: float = 0.95
+    acceleration_ratio: float = 0.95
+    jerk_ratio: float = 0.9  # a last stretch of time by less than a tick may exceed it by a tenth
+
+    def of_joints(self, kinematics: Kinematics) -> Array:
+        """Return the largest speed, acceleration and jerk (3, n)."""
+        return np.array(
+            [
+                self.joint_ratio * kinematics.velocity_rad_per_s,
+                self.acceleration_ratio * kinematics.acceleration_rad_per_s2,
+                self.jerk_ratio * kinematics.jerk_rad_per_s3,
+            ]
+        )
 
 
 def timed(
     kinematics: Kinematics,
-    path_rad: Array,
+    path: SmoothPath,
     *,
     flange_from_tool: RigidTransform,
     limits: SpeedLimits,
     name: str,
     guards: tuple[Guard, ...] = (),
 ) -> JointTrajectory:
-    """Return the trajectory along a smooth dense path (N, n), N >= 2, from rest to rest."""
-    s = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(path_rad, axis=0), axis=1), 1e-9))])
-    spline = CubicSpline(s, path_rad) if len(s) > 2 else CubicSpline(s, path_rad, bc_type="clamped")
-    if len(s) == 2:
-        spline = _line(s, path_rad)
-    grid = np.linspace(0.0, s[-1], max(12, int(np.ceil(s[-1] / SAMPLE_RAD)) + 1))
-    q, q_s, q_ss = spline(grid), spline(grid, 1), spline(grid, 2)
-    speed = _speed_profile(kinematics, grid, q, q_s, q_ss, flange_from_tool, limits)
-    mean = 0.5 * (speed[1:] + speed[:-1])
-    times = np.concatenate([[0.0], np.cumsum(np.diff(grid) / np.maximum(mean, 1e-6))])
-    return JointTrajectory(
-        name=name, times_s=times, positions_rad=q, velocities_rad_per_s=q_s * speed[:, None], guards=guards
-    )
-
-
-def _line(s: Array, path: Array) -> CubicSpline:
-    middle = 0.5 * (path[0] + path[1])
-    return CubicSpline([s[0], 0.5 * (s[0] + s[1]), s[1]], [path[0], middle, path[1]])
-
-
-def _speed_profile(
-    kinematics: Kinematics,
-    grid: Array,
-    q: Array,
-    q_s: Array,
-    q_ss: Array,
-    flange_from_tool: RigidTransform,
-    limits: SpeedLimits,
-) -> Array:
-    """Return the highest ds/dt (N,) on the grid, zero at both ends."""
-    v_max = limits.joint_ratio * kinematics.velocity_rad_per_s
-    a_max = 0.5 * limits.acceleration_ratio * kinematics.acceleration_rad_per_s2
+    """Return the trajectory along a path from rest to rest."""
+    dt_s = 1.0 / kinematics.capabilities.command_rate_hz
+    if path.length_rad < 1e-6:
+        still = path.points_rad[[0, -1]]
+        times = np.array([0.0, dt_s])
+        return JointTrajectory(
+            name=name, times_s=times, positions_rad=still, velocities_rad_per_s=0.0 * still, guards=guards
+        )
+    spacing = min(SAMPLE_RAD, float(np.min(path.reaches_rad[1:-1], initial=np.inf)) / SAMPLES_PER_REACH)
+    count = int(np.clip(np.ceil(path.length_rad / spacing), LEAST_SAMPLES, MOST_SAMPLES)) + 1
+    grid, step = np.linspace(0.0, path.length_rad, count, retstep=True)
+    geometry = path.at(grid)
     tool = np.ascontiguousarray(flange_from_tool.as_matrix())
-    tip = np.array(
-        [
-            np.linalg.norm(kernels.tool_and_jacobian(kinematics.dh, qi, tool)[1][:3] @ di)
-            for qi, di in zip(q, q_s, strict=True)
-        ]
-    )
+    tip = timing_kernels.tip_ways(kinematics.dh, geometry, tool)
+    s, stretch = _fastest(geometry, float(step), tip, limits.of_joints(kinematics), limits.tip_m_per_s, dt_s)
+    return _sampled(geometry, float(step), s, dt_s * stretch, name, guards)
+
+
+def _fastest(
+    geometry: Array, step: float, tip: Array, limits: Array, tip_m_per_s: float, dt_s: float
+) -> tuple[Array, float]:
+    """Return the distances (M,) at the ticks, and by how much the ticks must be stretched to keep all limits."""
+    ceiling = _speed_ceiling(geometry, tip, limits, tip_m_per_s) ** 2
+    rise_ticks = float(np.max(limits[1] / limits[2])) / dt_s
+    found = [
+        _smoothed(geometry, step, tip, limits, tip_m_per_s, dt_s, ceiling, max(1, int(np.ceil(rises * rise_ticks))))
+        for rises in RISES
+    ]
+    return min(found, key=lambda one: len(one[0]) * one[1])
+
+
+def _smoothed(
+    geometry: Array, step: float, tip: Array, limits: Array, tip_m_per_s: float, dt_s: float, ceiling: Array, width: int
+) -> tuple[Array, float]:
+    """Return what `_fastest` returns, for the mean over `width` ticks and a first ceiling (N,) of s'^2."""
+    best = np.empty(0), np.inf
+    for _ in range(ROUNDS):
+        x = timing_kernels.squared_speeds(geometry, step, ceiling, limits[1])
+        raw = timing_kernels.distances(x, step, dt_s)
+        s = timing_kernels.smoothed(raw, width)
+        joints = timing_kernels.joints_at(geometry, step, s)
+        excess = timing_kernels.demands(joints, s, step, tip, limits, tip_m_per_s, dt_s)
+        stretch = max(1.0, float(excess.max()))
+        if len(best[0]) == 0 or len(s) * stretch < len(best[0]) * best[1]:
+            best = s, stretch
+        if stretch < GOOD_ENOUGH:
+            break
+        ceiling = timing_kernels.lowered(ceiling, x, raw, excess, width, step, CURE)
+    return best
+
+
+def _speed_ceiling(geometry: Array, tip: Array, limits: Array, tip_m_per_s: float) -> Array:
+    """Return the highest ds/dt (N,) by speed, curvature and its change, each taken by itself."""
     tiny = 1e-9
-    ceiling = np.minimum.reduce(
+    _, q_s, q_ss, q_sss = np.abs(geometry)
+    highest: Array = np.minimum.reduce(
         [
-            np.min(v_max / (np.abs(q_s) + tiny), axis=1),
-            limits.tip_m_per_s / (tip + tiny),
-            np.sqrt(np.min(a_max / (np.abs(q_ss) + tiny), axis=1)),
+            np.min(limits[0] / (q_s + tiny), axis=1),
+            tip_m_per_s / (tip + tiny),
+            np.sqrt(np.min(limits[1] / (q_ss + tiny), axis=1)),
+            np.cbrt(np.min(limits[2] / (q_sss + tiny), axis=1)),
         ]
     )
-    push = np.min(a_max / (np.abs(q_s) + tiny), axis=1)  # (N,) highest s''
-    speed = ceiling.copy()
-    speed[0] = speed[-1] = 0.0
-    step = np.diff(grid)
-    for k in range(len(step)):
-        speed[k + 1] = min(speed[k + 1], np.sqrt(speed[k] ** 2 + 2.0 * push[k] * step[k]))
-    for k in range(len(step) - 1, -1, -1):
-        speed[k] = min(speed[k], np.sqrt(speed[k + 1] ** 2 + 2.0 * push[k + 1] * step[k]))
-    return np.asarray(speed)
+    return highest
+
+
+def _sampled(
+    geometry: Array, step: float, s: Array, tick_s: float, name: str, guards: tuple[Guard, ...]
+) -> JointTrajectory:
+    joints = timing_kernels.joints_at(geometry, step, s)
+    times = tick_s * np.arange(len(s), dtype=float)
+    # With the velocities of this spline the executor's cubics have a continuous acceleration.
+    velocities = CubicSpline(times, joints, bc_type="clamped")(times, 1)
+    return JointTrajectory(
+        name=name, times_s=times, positions_rad=joints, velocities_rad_per_s=velocities, guards=guards
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,14 +10,15 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.errors import Unreachable
 from hal.motion import Guard, JointTrajectory
-from manipulation.planning.collision import CollisionModel
+from manipulation.planning.collision import RECHECK_RAD, CollisionModel
 from manipulation.planning.rrt import connect, shortcut
+from manipulation.planning.smooth_path import SmoothPath
 from manipulation.planning.time_parameterization import SpeedLimits, timed
 
 SEARCH_STEP_RAD = 0.02  # checking step of the search; the result is checked again at RECHECK_RAD
 DETOUR_RAD = 0.8  # how far a joint may leave the range between its two ends in the first search
 END_SHARE = 0.9  # of the gap at an end; with all of it the end itself would violate the margin by rounding
-CORNER_RAD = 0.25  # how far before a corner its rounding begins
+REACHES = 0.5 ** np.arange(7)  # widths of a corner's rounding that are tried, in turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +70,7 @@ class TransferPlanner:
             return self.model.free_fraction(a, b, margin_m=margin, step_rad=step)
 
         if self.model.free_fraction(start_rad, goal_rad, margin_m=margin) == 1.0:
-            return self._timed(np.array([start_rad, goal_rad]), name, guards)
+            return self._timed(SmoothPath.of(np.array([start_rad, goal_rad])), name, guards)
         kin = self.model.kinematics
         lower, upper = self._search_range(start_rad, goal_rad)
         for attempt in range(effort.searches):
@@ -105,16 +105,23 @@ class TransferPlanner:
         upper = np.minimum(kin.upper_rad, np.maximum(start, goal) + DETOUR_RAD)
         return lower, upper
 
-    def _rounded(self, path: Array, margin: float) -> Array | None:
-        """Sample the path densely with parabolic corners, made tighter until all of it is free; None if none is."""
-        for corner in (CORNER_RAD, CORNER_RAD / 3, CORNER_RAD / 10, CORNER_RAD / 30):
-            dense = round_corners(path, corner)
-            steps = itertools.pairwise(dense)
-            if all(self.model.free_fraction(a, b, margin_m=0.5 * margin) == 1.0 for a, b in steps):
-                return dense
-        return None
+    def _rounded(self, path: Array, margin: float) -> SmoothPath | None:
+        """Round each corner as widely as its legs and the obstacles allow; None if one cannot be rounded."""
+        smooth = SmoothPath.of(path)
+        for index in range(1, len(smooth.points_rad) - 1):
+            most = float(smooth.reaches_rad[index])
+            for reach in most * REACHES:
+                smooth = smooth.with_reach(index, reach)
+                if self._is_free(smooth.corner(index, RECHECK_RAD), 0.5 * margin):
+                    break
+            else:
+                return None
+        return smooth
 
-    def _timed(self, path: Array, name: str, guards: tuple[Guard, ...]) -> JointTrajectory:
+    def _is_free(self, samples: Array, margin: float) -> bool:
+        return all(self.model.is_clear(q, margin_m=margin) for q in samples)
+
+    def _timed(self, path: SmoothPath, name: str, guards: tuple[Guard, ...]) -> JointTrajectory:
         return timed(
             self.model.kinematics,
             path,
@@ -128,25 +135,3 @@ class TransferPlanner:
         fraction = self.model.free_fraction(start, goal, margin_m=margin)
         beyond = min(1.0, fraction + 0.02)
         return self.model.nearest(start + beyond * (goal - start))
-
-
-def round_corners(path_rad: Array, corner_rad: float, *, spacing_rad: float = 0.05) -> Array:
-    """Return a dense path (M, n) along the polyline (N, n) whose parabolic corners begin `corner_rad` before each."""
-    out = [path_rad[0]]
-    for before, at, after in zip(path_rad, path_rad[1:], path_rad[2:], strict=False):
-        back, ahead = before - at, after - at
-        lengths = float(np.linalg.norm(back)), float(np.linalg.norm(ahead))
-        reach = min(corner_rad, 0.45 * lengths[0], 0.45 * lengths[1])
-        a, b = at + back * (reach / lengths[0]), at + ahead * (reach / lengths[1])
-        _append_line(out, a, spacing_rad)
-        # Quadratic Bezier with the corner as its control point: tangent to both legs.
-        for u in np.linspace(0.0, 1.0, 7)[1:]:
-            out.append((1 - u) ** 2 * a + 2 * u * (1 - u) * at + u**2 * b)
-    _append_line(out, path_rad[-1], spacing_rad)
-    return np.array(out)
-
-
-def _append_line(out: list[Array], end: Array, spacing: float) -> None:
-    start = out[-1]
-    count = int(np.ceil(np.linalg.norm(end - start) / spacing))
-    out.extend(start + (k / count) * (end - start) for k in range(1, count + 1))

@@ -17,7 +17,7 @@ from manipulation.planning import clearance
 from manipulation.planning.collision import RECHECK_RAD, CollisionModel, placed
 from manipulation.planning.shapes import Capsule, CollisionBox, envelope, floor_box, panel_boxes
 from manipulation.planning.time_parameterization import SpeedLimits
-from manipulation.planning.transfer import TransferPlanner, round_corners
+from manipulation.planning.transfer import TransferPlanner
 from tests.manipulation.arms import T3
 
 points = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.array)
@@ -114,29 +114,6 @@ def test_a_goal_inside_an_obstacle_is_unreachable_and_named() -> None:
     )
     with pytest.raises(Unreachable, match="cupboard"):
         _planner(box).plan(start, goal)
-
-
-def test_a_transfer_keeps_to_joint_and_tip_limits() -> None:
-    start, goal, wall = _obstacle()
-    for boxes in ((), (wall,)):
-        motion = _planner(*boxes).plan(start, goal)
-        t = np.linspace(0, motion.times_s[-1], 4000)
-        from scipy.interpolate import CubicHermiteSpline
-
-        spline = CubicHermiteSpline(motion.times_s, motion.positions_rad, motion.velocities_rad_per_s)
-        v = spline(t, 1)
-        assert np.all(np.abs(v) <= 0.55 * KINEMATICS.velocity_rad_per_s)
-        tool = transform_rpy((0, 0, 0.15), (0, 0, 0))
-        tips = np.array([KINEMATICS.tool(q, tool).translation for q in spline(t)])
-        assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / (t[1] - t[0]) < 0.27
-        assert np.all(v[0] == 0) and np.allclose(v[-1], 0, atol=1e-9)
-
-
-def test_rounded_corners_keep_the_ends_and_stay_near() -> None:
-    path = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    dense = round_corners(path, 0.2)
-    assert np.array_equal(dense[0], path[0]) and np.array_equal(dense[-1], path[-1])
-    assert np.linalg.norm(dense - path[1], axis=1).min() == pytest.approx(0.2 * np.sqrt(2) / 4, abs=0.02)
 
 
 def make_panel() -> Panel:

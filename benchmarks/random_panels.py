@@ -10,7 +10,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from service.sweep.run import SweepOptions, run_panel
+from service.sweep.options import SweepOptions
+from service.sweep.run import run_panel
 from service.sweep.table import report
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,7 +14,10 @@ from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.warm import compile_first
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from service.sweep.ask import PanelRun
+    from service.sweep.options import SweepOptions
 
 
 def sweep(
@@ -35,7 +38,6 @@ def sweep(
     scheduler: Annotated[
         str, typer.Option(help='Scheduler: "local", or tcp://host:port of a dask scheduler.')
     ] = "local",
-    each: Annotated[bool, typer.Option("--each", help="Also print the deeds that were right.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for sweep.md and sweep.json.")] = Path("runs/sweep"),
     draw: Annotated[
         Path | None, typer.Option(help="Only write the panel and cell files into this folder, and run nothing.")
@@ -45,10 +47,8 @@ def sweep(
 
     The exit code is 1 when a control was said to be done and was not, or when something moved that was not named.
     """
-    from service.sweep.run import SweepOptions, chosen, write_files
-    from service.sweep.sweep import sweep as run_sweep
-    from service.sweep.sweep import write
-    from service.sweep.table import report
+    from service.sweep.files import write_files
+    from service.sweep.options import SweepOptions, chosen
 
     options = SweepOptions(cell=find_cell(cell).resolve(), only=chosen(only), known_pose=known_pose, mission=mission)
     seeds = range(first, first + panels)
@@ -58,16 +58,25 @@ def sweep(
             console.print(f"wrote {write_files(seed, options.cell, draw / str(seed))}", markup=False)
         return
     compile_first()
+    leave(_run(seeds, options, scheduler=scheduler, workers=workers, out=out))
+
+
+def _run(seeds: Sequence[int], options: SweepOptions, *, scheduler: str, workers: int, out: Path) -> int:
+    """Run the panels, print and write the tables of those that have ended, and return the exit code."""
+    from service.sweep.sweep import sweep as run_sweep
+    from service.sweep.sweep import write
+    from service.sweep.table import report
+
     runs: list[PanelRun] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     code = 0
     with one_interrupt(), Progress(*columns, console=console) as bar:
-        task = bar.add_task("panels", total=panels)
+        task = bar.add_task("panels", total=len(seeds))
 
         def note(run: PanelRun) -> None:
             runs.append(run)
             bar.update(task, advance=1)
-            bar.console.print(_lines(run, each=each))
+            bar.console.print(_lines(run, each=len(seeds) == 1))
 
         try:
             runs = run_sweep(seeds, options, scheduler=scheduler, workers=workers, progress=note)
@@ -75,10 +84,9 @@ def sweep(
             code = INTERRUPTED
     if runs:
         console.print(report(runs), markup=False, highlight=False)
-        written = write(runs, options, out)
-        console.print("wrote " + ", ".join(str(path) for path in written), markup=False)
+        console.print("wrote " + ", ".join(str(path) for path in write(runs, options, out)), markup=False)
     is_untrue = any(deed.is_untrue for run in runs for deed in run.deeds)
-    leave(code or (1 if is_untrue or any(run.problem for run in runs) else 0))
+    return code or (1 if is_untrue or any(run.problem for run in runs) else 0)
 
 
 def _lines(run: PanelRun, *, each: bool) -> str:

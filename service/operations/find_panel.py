@@ -201,8 +201,7 @@ def reference_in_view(session: Session) -> tuple[Array, Array]:
         return lights.points_px, lights.covariance_px
     settle(session)
     taken = look(session)
-    seen = _find(session, taken, way)
-    wanted = reference_points_m(session)
+    seen, wanted = _find(session, taken, way), reference_points_m(session)
     order = [int(np.linalg.norm(seen.points_m - point, axis=1).argmin()) for point in wanted]
     if len(set(order)) < len(wanted) or not np.allclose(seen.points_m[order], wanted):
         raise NotFound(

@@ -15,7 +15,8 @@ from typing import Any
 
 from hal.workers import as_they_end, workers_of
 from service.sweep.ask import PanelRun
-from service.sweep.run import SweepOptions, run_panel
+from service.sweep.options import SweepOptions
+from service.sweep.run import run_panel
 from service.sweep.table import report
 
 RETRIES = 1  # of a panel whose worker died

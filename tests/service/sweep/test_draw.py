@@ -17,8 +17,8 @@ from hal.config import load_cell
 from hal.panel import Panel
 from hal.strict import validate
 from service.sweep.draw import NOMINAL, STATED_RATIO, DrawnPanel, draw_panel
+from service.sweep.files import write_files
 from service.sweep.layout import GAP_M
-from service.sweep.run import write_files
 
 ROOT = Path(__file__).parents[3]
 DRAWN = [draw_panel(seed) for seed in range(300)]

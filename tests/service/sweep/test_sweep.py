@@ -11,7 +11,8 @@ from hal.config import load_cell
 from hal.errors import InvalidRequest
 from service.cli import _app
 from service.sweep.ask import PanelRun
-from service.sweep.run import SweepOptions, chosen, run_panel
+from service.sweep.options import SweepOptions, chosen
+from service.sweep.run import run_panel
 from service.sweep.sweep import hash_of, sweep
 
 BENCH = Path(__file__).parents[3] / "cells/bench.toml"

@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 
 from service.sweep.ask import PanelRun
 from service.sweep.judge import JudgedDeed, Verdict
-from service.sweep.run import SweepOptions
+from service.sweep.options import SweepOptions
 from service.sweep.sweep import hash_of, write
 from service.sweep.table import report, wilson
 

@@ -15,6 +15,7 @@ from hal.arrays import Array
 from hal.errors import DeviceFault, MotionError, MotionRefused
 from hal.motion import CartesianPath, Compliance, GripperMotion, Guard, MotionReport, Quantity
 from manipulation.planning.cartesian_path import line, shifted
+from manipulation.planning.smooth_path import SmoothPath
 from manipulation.planning.time_parameterization import SpeedLimits, timed
 from manipulation.skills.attempt import LET_GO_N, PADS_M_PER_S, RETREAT_M, RETREAT_M_PER_S, Attempt
 from manipulation.skills.context import SkillContext
@@ -173,7 +174,7 @@ def step_back(context: SkillContext, report: MotionReport) -> None:
         return
     motion = timed(
         context.kinematics,
-        path,
+        SmoothPath.of(path),
         flange_from_tool=context.flange_from_grip,
         limits=SpeedLimits(tip_m_per_s=UNFELT_M_PER_S),
         name="step back",

@@ -86,10 +86,9 @@ async def reset_stop(
     lease_token: LeaseToken = None,
 ) -> StopView:
     holder = state.service.lease.check(lease_token)
-    supervisor = state.service.supervisor
-    seen = supervisor.latch.state().count if request.seen_count is None else request.seen_count
     source = f"POST /v1/stop/reset by {holder or 'a client without a lease'}"
-    return _stop(state, await state.act(functools.partial(supervisor.reset, source, seen_count=seen)))
+    reset = functools.partial(state.service.supervisor.reset, source, seen_count=request.seen_count)
+    return _stop(state, await state.act(reset))
 
 
 def _lease(state: AppState) -> LeaseView:

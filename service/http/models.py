@@ -221,9 +221,19 @@ class StopView(BaseModel):
 
 
 class ResetRequest(Strict):
-    """Clear the stop. With `seen_count` it is refused if the stop was latched again after that count."""
+    """Clear the stop that the caller has seen; it is refused if the stop has changed since."""
 
-    seen_count: Annotated[int, Field(ge=0, lt=2**63)] | None = None
+    seen_count: (
+        Annotated[
+            int,
+            Field(
+                ge=0,
+                lt=2**63,
+                description="`count` of the stop that the caller has seen; without it, a stop of the last second stays latched",
+            ),
+        ]
+        | None
+    ) = None
 
 
 class MissionView(BaseModel):

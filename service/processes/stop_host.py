@@ -109,6 +109,8 @@ class ProcessStop:
         Raises:
             MotionRefused: it did not answer in time; a late answer clears nothing.
         """
+        if self._latch.state().count != seen_count:
+            return False
         self._is_ready.wait(READY_S)
         is_told = self._child.write_line(f"reset {seen_count} {_line(source)}")
         if not (is_told and self._has_changed(seen_count, RESET_ANSWER_S)):
@@ -117,7 +119,8 @@ class ProcessStop:
                 f"the stop process did not answer within {RESET_ANSWER_S:.0f} s, so the stop stays latched",
                 hint="look at the cell, then reset again; is the machine overloaded?",
             )
-        return not self._latch.is_set()
+        now = self._latch.state()
+        return not now.is_latched and now.count == seen_count + 1
 
     def is_alive(self) -> bool:
         """Whether the process is running."""

@@ -29,6 +29,7 @@ START_TIMEOUT_S = 400.0  # the first start compiles the control kernels, which t
 MAX_RESTARTS = 3
 BEAT_TIMEOUT_S = 10.0  # numba's compiler can hold the interpreter lock for seconds, which delays the beat thread
 WATCH_S = 0.1
+SEEN_S = 1.0  # nobody has seen a stop that is younger
 log = logging.getLogger(__name__)
 
 
@@ -135,6 +136,7 @@ class Supervisor:
         self._is_closing = threading.Event()
         self._lock = threading.RLock()
         self._noted = self.latch.state().count
+        self._noted_s = time.monotonic()
         self._noting = threading.Lock()
 
     @property
@@ -194,25 +196,42 @@ class Supervisor:
             state = self.latch.state()
             if state.count <= self._noted:
                 return
-            self._noted = state.count
+            self._noted, self._noted_s = state.count, time.monotonic()
         if state.is_latched:
             self._report("stop", {"source": state.source, "count": state.count})
 
-    def reset(self, source: str, *, seen_count: int) -> LatchState:
+    def reset(self, source: str, *, seen_count: int | None) -> LatchState:
         """Clear the latch; this alone moves nothing.
+
+        Args:
+            seen_count: the latch's count that the caller has seen; None for whichever stop is older than a second.
 
         Raises:
             MotionRefused: the stop was latched again meanwhile, or the stop process is down or does not answer.
         """
         self.note_stop()  # before the reset overwrites the latch's record
+        if seen_count is None:
+            seen_count = self._count_of_old_stop()
         if not self._stop.is_alive():
             raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
         if not self._stop.reset(source, seen_count=seen_count):
             raise MotionRefused(
-                "the stop was pressed again, so it stays latched", hint="look at the cell, then reset again"
+                f"the stop was pressed again or reset since count {seen_count}, so this reset does nothing",
+                hint="look at the cell, GET /v1/stop, then reset with its newest `count`",
             )
         self._report("stop-reset", {"source": source, "count": seen_count})
         return self.latch.state()
+
+    def _count_of_old_stop(self) -> int:
+        """Return the latch's count; refuse if it is latched for less time than a person needs to see it."""
+        with self._noting:
+            count, age_s = self._noted, time.monotonic() - self._noted_s
+        if self.latch.is_set() and age_s < SEEN_S:
+            raise MotionRefused(
+                f"the stop was pressed {age_s:.1f} s ago, so it stays latched",
+                hint="look at the cell, GET /v1/stop, then reset with its `count` as `seen_count`",
+            )
+        return count
 
     def swap(self, name: str, section: DeviceSection) -> None:
         """Replace the device called `name`, also for later restarts of the cell process; see `device_slots.Swapper`."""

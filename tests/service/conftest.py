@@ -135,5 +135,5 @@ def client(served: Panelwright) -> Iterator[httpx2.Client]:
         served.service.lease.release(served.service.lease.take_over("cleaner").token)
         for name in served.service.cell.file.devices:
             served.service.supervisor.connection.device(name).inject_fault(None)
-        assert http.post("/v1/stop/reset").status_code == 200
+        assert http.post("/v1/stop/reset", json={"seen_count": http.get("/v1/stop").json()["count"]}).status_code == 200
         yield http

@@ -214,7 +214,14 @@ def test_a_holder_may_have_any_name_that_can_be_shown(client: httpx2.Client) -> 
     grant = client.post("/v1/lease", json={"holder": "Zoë@кухня-2"}).json()
     assert client.get("/v1/lease").json()["holder"] == "Zoë@кухня-2"
     assert client.post("/v1/lease", json={"holder": "bob"}).json()["detail"] == "Zoë@кухня-2 holds the cell"
-    assert client.post("/v1/stop/reset", headers={"Lease-Token": grant["token"]}).status_code == 200
+    assert (
+        client.post(
+            "/v1/stop/reset",
+            json={"seen_count": client.get("/v1/stop").json()["count"]},
+            headers={"Lease-Token": grant["token"]},
+        ).status_code
+        == 200
+    )
     client.post("/v1/lease/release", headers={"Lease-Token": grant["token"]})
     for bad in ("two\nlines", "a\u202eb", ""):
         refused = client.post("/v1/lease", json={"holder": bad})
@@ -274,8 +281,13 @@ def test_stop_ends_a_motion_and_nothing_moves_until_reset_and_a_new_command(
     assert client.get("/v1/stop").json()["is_latched"]
     stale = client.post("/v1/stop/reset", json={"seen_count": stopped["count"] - 1})
     assert stale.status_code == 409
+    unseen = client.post("/v1/stop/reset", json={})
+    assert unseen.status_code == 409, "nobody has seen a stop of this very moment"
+    assert "s ago" in unseen.json()["detail"]
     assert client.post("/v1/stop/reset", json={"seen_count": stopped["count"]}).json()["is_latched"] is False
     assert not served.service.supervisor.connection.mover.state().is_moving, "a reset alone moves nothing"
+    again = client.post("/v1/stop/reset", json={"seen_count": stopped["count"]})
+    assert again.status_code == 409, "a second reset with the same count is one with an old count"
     assert client.post("/v1/hold?wait_s=10", json={"seconds": 0.1}).status_code == 200
 
 
@@ -339,7 +351,10 @@ def test_a_device_that_hangs_holds_up_neither_stop_nor_tasks(client: httpx2.Clie
         reads = [pool.submit(crowd.get, "/v1/devices/wrist_camera/reading") for _ in range(45)]
         eventually(lambda: sum(read.done() for read in reads) >= 5)
         assert client.post("/v1/stop").json()["is_latched"]
-        assert client.post("/v1/stop/reset").status_code == 200
+        assert (
+            client.post("/v1/stop/reset", json={"seen_count": client.get("/v1/stop").json()["count"]}).status_code
+            == 200
+        )
         assert client.post("/v1/echo?wait_s=10", json={}).status_code == 200
         refused = [read.result() for read in reads if read.done()]
         assert {(answer.status_code, answer.json()["type"]) for answer in refused} == {(503, "urn:panelwright:busy")}

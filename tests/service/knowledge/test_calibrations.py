@@ -142,7 +142,7 @@ def test_a_latched_stop_refuses_to_calibrate_but_lets_plan(web: httpx2.Client) -
     planned = web.post("/v1/calibrations?wait_s=30", json={"what": "tool", "poses": 5, "dry_run": True})
     assert planned.status_code == 200, planned.text
     assert len(planned.json()["result"]["stations"]) == 5
-    assert web.post("/v1/stop/reset").status_code == 200
+    assert web.post("/v1/stop/reset", json={"seen_count": web.get("/v1/stop").json()["count"]}).status_code == 200
 
 
 def test_a_mount_that_is_not_on_the_hand_is_refused(write_cell: WriteCell, tmp_path: Path) -> None:

@@ -241,7 +241,7 @@ def test_the_swapped_device_is_there_again_after_a_restart_of_the_cell_process(
     assert http.get(SENSOR).json()["driver"] == "serial:tfmini"
     assert value(http) == pytest.approx(0.456)
     assert http.get("/v1/stop").json()["is_latched"]
-    http.post("/v1/stop/reset")
+    http.post("/v1/stop/reset", json={"seen_count": http.get("/v1/stop").json()["count"]})
 
 
 @pytest.fixture(scope="module")

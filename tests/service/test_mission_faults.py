@@ -47,7 +47,7 @@ class Bench:
 
     def begin_mission(self) -> str:
         """Start a mission; return its URL when the arm moves."""
-        self.client.post("/v1/stop/reset", {"seen_count": self.client.get("/v1/stop").json()["count"]})
+        self.client.post("/v1/stop/reset", json={"seen_count": self.client.get("/v1/stop").json()["count"]})
         url = self.client.post("/v1/missions", json={}).headers["location"]
         eventually(lambda: self.task(url)["state"] == "running", timeout_s=120.0)
         eventually(lambda: self.task(url)["fraction"] > 0.06, timeout_s=300.0)
@@ -72,7 +72,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 
 def test_recognise_by_range_finds_mushroom_and_wheel_of_a_panel_that_nobody_has_located(bench: Bench) -> None:
-    bench.client.post("/v1/stop/reset", {"seen_count": bench.client.get("/v1/stop").json()["count"]})
+    bench.client.post("/v1/stop/reset", json={"seen_count": bench.client.get("/v1/stop").json()["count"]})
     task = bench.ended(bench.client.post("/v1/recognise", json={"use": ["range"]}).headers["location"])
     assert task["state"] == "succeeded", task["problem"]
     answer = task["result"]

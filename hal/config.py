@@ -12,6 +12,7 @@ from hal.calibration import CalibrationRecord, Vector3, load_calibration
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from hal.panel import Panel, load_panel
+from hal.simulated_events import EventSection
 from hal.strict import Strict, load_toml
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
@@ -75,6 +76,9 @@ class SimulationSection(Strict):
     """`[simulation]`: things in the simulated world that the panel file does not describe."""
 
     cables: Annotated[tuple[CableSection, ...], Field(max_length=20)] = ()
+    events: Annotated[
+        tuple[EventSection, ...], Field(max_length=20, description="what happens in the world while it runs")
+    ] = ()
     built_panel: Annotated[
         str | None,
         Field(description="panel file of the panel as built; if null, the panel is as `cell.panel` states it"),

@@ -20,6 +20,7 @@ from hal.registry import Context
 from hal.simulated import Truth
 from simbackend.arm_model import MODELS
 from simbackend.draws import Draws
+from simbackend.events import NearTriggers, schedule
 from simbackend.link import WorldLink
 from simbackend.wire import (
     DOF,
@@ -38,6 +39,7 @@ from simbackend.wire import (
 
 PROXIMITY_RANGE_M = 0.6
 MOST_TICKS_BEHIND = 100
+NEAR_TICKS = 4  # how often what waits for the finger tips is checked; the world updates their place as often
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +81,8 @@ class WorldClient:
         self._link = WorldLink(config)
         self._take(self._link.first)
         self._begun_s = clock.now_s()
+        self.near = NearTriggers()
+        schedule(self)
         clock.attach(self.advance)  # type: ignore[attr-defined]  # checked by `start`
 
     @classmethod
@@ -130,6 +134,7 @@ class WorldClient:
             while ticks > 0:
                 now = self.frame.snapshot.tick
                 part = min(ticks, max(1, self._events[0][0] - now)) if self._events else ticks
+                part = min(part, NEAR_TICKS) if self.near.waiting else part
                 self._step(part)
                 ticks -= part
                 self._run_events()
@@ -176,6 +181,9 @@ class WorldClient:
     def _run_events(self) -> None:
         while self._events and self._events[0][0] <= self.frame.snapshot.tick:
             heapq.heappop(self._events)[2]()
+        if self.near.waiting:
+            snapshot = self.frame.snapshot
+            self.near.check(snapshot.tip_m, snapshot.stamp_s)
 
     # -- commands, all stored until the next step ---------------------------------------------------------------------
 
@@ -249,6 +257,11 @@ class WorldClient:
                 device="world",
             )
         return truth
+
+    def ask(self, op: Op, *arguments: float) -> object:
+        """Send any other request to the world, and return its answer."""
+        with self._lock:
+            return self._link.ask(op, *arguments)
 
     def close(self) -> None:
         """End the world; a second call does nothing."""

@@ -12,20 +12,21 @@ from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 from hal.registry import Context
 from hal.simulated import Fault
+from hal.simulated_events import When
 from hal.strict import Strict, validate
 from simbackend.client import Frame, WorldClient
+from simbackend.events import begin_when
 from simbackend.wire import Snapshot
 
 T = TypeVar("T")
 Options = TypeVar("Options", bound="SimOptions")
 
 
-class FaultOption(Strict):
-    """`fault = { kind = "stale", at_s = 3.0 }`: begins at a simulated time."""
+class FaultOption(When):
+    """`fault = { kind = "stale", at_s = 3.0 }`: begins at a simulated time, or with `near` when the tips are there."""
 
     kind: Annotated[Fault, Field(description="fault that begins")]
     magnitude: Annotated[float, Field(description="size of a bias, in the unit of the reading")] = 0.0
-    at_s: Annotated[float, Field(description="simulated time at which it begins")] = 0.0
 
 
 class SimOptions(Strict):
@@ -60,7 +61,7 @@ class SimDevice(Generic[T]):
         self._last_s: float | None = None
         if options.fault is not None:
             fault = options.fault
-            self._world.at(fault.at_s, lambda: self.inject_fault(fault.kind, magnitude=fault.magnitude))
+            begin_when(self._world, fault, lambda: self.inject_fault(fault.kind, magnitude=fault.magnitude))
 
     @property
     def name(self) -> str:

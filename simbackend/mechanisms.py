@@ -16,6 +16,7 @@ DAMPING_N_S_PER_M = 4.0
 TURN_DAMPING_NM_S_PER_RAD = 0.05
 SLIDE_DAMPING_N_S_PER_M = 5.0
 LOCK_EFFORT = 200.0
+BLOCKED_EFFORT = 2000.0  # N or N m
 SNAP_GAIN_PER_S = 40.0
 
 
@@ -34,6 +35,10 @@ class Mechanism(Protocol):
 
     def place(self) -> float:
         """Return the present joint position, rad or m."""
+        ...
+
+    def block(self) -> None:
+        """Let the part not give way to any force from now on."""
         ...
 
 
@@ -58,6 +63,11 @@ class Friction:
         """Brake with a velocity motor at zero speed and limited effort, which breaks away within 5 % of that effort."""
         _hold(self.engine, self.body, speed=0.0, effort=self.effort)
 
+    def block(self) -> None:
+        """Let friction hold the part against any force."""
+        self.effort = BLOCKED_EFFORT
+        self.drive()
+
     def place(self) -> float:
         """Return the joint position."""
         return float(self.engine.getJointState(self.body, JOINT)[0])
@@ -80,17 +90,27 @@ class Spring:
     is_latched: bool = False
     is_in: bool = False
     presses: int = 0
+    is_blocked: bool = False
+
+    def block(self) -> None:
+        """Hold the cap where it is against any force."""
+        self.is_blocked = True
+        _hold(self.engine, self.body, speed=0.0, effort=BLOCKED_EFFORT)
 
     def lock(self) -> None:
         """Hold the cap."""
-        _hold(self.engine, self.body, speed=0.0, effort=LOCK_EFFORT)
+        _hold(self.engine, self.body, speed=0.0, effort=BLOCKED_EFFORT if self.is_blocked else LOCK_EFFORT)
 
     def free(self) -> None:
-        """Release the cap, so that `drive` alone moves it."""
+        """Release the cap, so that `drive` alone moves it, unless it is blocked."""
+        if self.is_blocked:
+            return
         _hold(self.engine, self.body, speed=0.0, effort=0.0)
 
     def drive(self) -> None:
         """Apply the spring force k x + preload outwards and viscous damping, and update the switch."""
+        if self.is_blocked:
+            return
         x, v = self.engine.getJointState(self.body, JOINT)[:2]
         self._switch(x)
         rest_m = -self.latched_depth_m if self.is_latched else 0.0
@@ -143,6 +163,10 @@ class Detent:
         error = self.nearest(x) - x
         speed = max(-self.max_speed, min(self.max_speed, SNAP_GAIN_PER_S * error))
         _hold(self.engine, self.body, speed=speed, effort=self.effort)
+
+    def block(self) -> None:
+        """Let the detent hold the part against any force."""
+        self.effort = BLOCKED_EFFORT
 
     def nearest(self, x: float) -> float:
         """Return the resting place nearest to `x`."""

@@ -61,7 +61,7 @@ class PanelWorld:
         for tag in self.panel.tags:
             self._print_tag(tag, self.panel.tolerances.tag_m * draws.stream(f"tag/{tag.name}").standard_normal(2))
         self._shines: dict[str, Shine] = {}
-        self._light_places: list[tuple[float, float, float]] = []
+        self.light_places: list[tuple[float, float, float]] = []
         for light in self.panel.lights:
             jitter = self.panel.tolerances.light_m * draws.stream(f"light/{light.name}").standard_normal(3)
             self._load_light(light, jitter)
@@ -73,16 +73,17 @@ class PanelWorld:
         self.scene = self._draw_up()
         self.lamps_on = {name: self.built[name].start.is_on for name in self._shines}
         for name, on in self.lamps_on.items():
-            self._paint_lamp(name, on=on)
+            self.paint_lamp(name, on=on)
         for light in self.panel.lights:
             self._paint(light.name, LIGHT_OFF, 1.0, on=False)
         self._presses = dict.fromkeys(self.mechanisms, 0)
-        self._points = {
+        self.points = {
             name: tuple(self.object_pose(self.built[name]).translation.tolist())
             for name, mechanism in self.mechanisms.items()
             if not isinstance(mechanism, Friction)
         }
         self._alive: set[str] = set()
+        self.dead: set[str] = set()  # lamps and border lights that stay dark
         self._order: list[str] = []
         for mechanism in self.mechanisms.values():
             mechanism.lock()
@@ -160,7 +161,7 @@ class PanelWorld:
         pose = self.base_from_panel * RigidTransform.from_translation([x + jitter[0], y + jitter[1], jitter[2]])
         self._load_urdf(light.name, light_urdf(light), pose)
         x, y, z = pose.apply([0, 0, z]).tolist()
-        self._light_places.append((x, y, z))
+        self.light_places.append((x, y, z))
 
     def _load_urdf(self, name: str, text: str, pose: RigidTransform) -> int:
         path = self.folder / f"{name}.urdf"
@@ -205,7 +206,7 @@ class PanelWorld:
         x, y, z = tip_m
         near = {
             name
-            for name, (px, py, pz) in self._points.items()
+            for name, (px, py, pz) in self.points.items()
             if (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2 < NEAR_M**2
         }
         if near != self._alive:
@@ -238,10 +239,11 @@ class PanelWorld:
         self._presses[name] = button.presses
         lamp = self.built[name].panel_object.shown_by
         if lamp in self.lamps_on:
-            self.lamps_on[lamp] = not self.lamps_on[lamp]
-            self._paint_lamp(lamp, on=self.lamps_on[lamp])
+            self.lamps_on[lamp] = not self.lamps_on[lamp] and lamp not in self.dead
+            self.paint_lamp(lamp, on=self.lamps_on[lamp])
 
-    def _paint_lamp(self, name: str, *, on: bool) -> None:
+    def paint_lamp(self, name: str, *, on: bool) -> None:
+        """Let an indicator lamp look lit or dark."""
         colour = self._shines[name].colour
         self._paint(name, GLOW[colour] if on else PAINT[colour], LAMP_RADIANCE if on else DIM, on=on)
 
@@ -255,6 +257,7 @@ class PanelWorld:
     def switch_lights(self, on: list[bool]) -> None:
         """Switch the border lights, in the order of the panel file."""
         for i, (light, lit) in enumerate(zip(self.panel.lights, on, strict=True)):
+            lit = lit and light.name not in self.dead  # noqa: PLW2901 - a dead light is never lit
             if bool(self.lights_on[i]) != lit:
                 self.lights_on[i] = float(lit)
                 self._paint(light.name, LIGHT_GLOW if lit else LIGHT_OFF, LIGHT_RADIANCE if lit else 1.0, on=lit)
@@ -263,7 +266,7 @@ class PanelWorld:
         """Return everything that shines now."""
         lit = [
             Emitter(colour=LIGHT_GLOW, position_m=place, radius_m=light.radius_m, is_border_light=True)
-            for light, place, on in zip(self.panel.lights, self._light_places, self.lights_on, strict=True)
+            for light, place, on in zip(self.panel.lights, self.light_places, self.lights_on, strict=True)
             if on
         ]
         for name, on in self.lamps_on.items():

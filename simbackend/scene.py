@@ -109,6 +109,15 @@ class Scene:
                 for compiled in self._compiled.values():
                     compiled.albedo[part.rows] = compiled.mix(np.asarray(colour))
 
+    def shift_prints(self, moved: RigidTransform) -> None:
+        """Move all printed faces by a displacement in the base frame."""
+        turn = np.asarray(moved.rotation.as_matrix())
+        for part in self._parts:
+            if part.body < 0:
+                self._points[part.rows] = self._points[part.rows] @ turn.T + moved.translation
+                self._mesh.normals[part.rows] = self._mesh.normals[part.rows] @ turn.T
+                self._shade[part.rows] = _shade(self._mesh.normals[part.rows])
+
     def shine(self, body: int, link: int, *, on: bool) -> None:
         """Set whether a link shines; a shining link is equally bright from all sides."""
         for part in self._parts:

@@ -26,6 +26,7 @@ class Op(IntEnum):
     STEP = 1
     RENDER = 2
     TRUTH = 3
+    EVENT = 4
 
 
 class DriveCommand(IntEnum):
@@ -75,6 +76,11 @@ class Snapshot:
     def is_enabled(self) -> bool:
         """Return whether the drives follow set-points."""
         return bool(self.vector[2])
+
+    @property
+    def tip_m(self) -> Array:
+        """Return the (3,) place of the finger tips in the base frame, at most four ticks old."""
+        return self.vector[3:6]
 
     @property
     def position_rad(self) -> Array:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.simulated import ObjectTruth, Truth
+from simbackend import panel_events
 from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
 from simbackend.contact_log import ContactLog
 from simbackend.draws import Draws
@@ -35,7 +36,7 @@ from simbackend.wire import (
 
 GRAVITY_M_PER_S2 = 9.81
 TIP_TICKS = 4  # how often to check which mechanisms are near; the tip moves up to 8 mm meanwhile
-UNUSED_7 = (0.0,) * 7  # values of the snapshot that are always zero
+UNUSED_4 = (0.0,) * 4  # values of the snapshot that are always zero
 FINGER_FORCE_N = 250.0  # of the motors, far above the gripper's: its own model limits the grip force
 ARM_GAIN, FINGER_GAIN = 0.45, 0.6  # fraction of a joint's error that its motor corrects in one tick
 CONE_RAYS = 4
@@ -54,6 +55,7 @@ class World:
         self.dt_s = 1.0 / self.cell.file.cell.control_rate_hz
         self.draws = Draws(self.cell.file.cell.seed)
         self.tick = 0
+        self._begun: dict[int, RigidTransform] = {}  # base_from_panel when an event began
         self.pad_force_n = (0.0, 0.0)
         self.engine: Any = pybullet
         pybullet.connect(pybullet.DIRECT)
@@ -230,7 +232,7 @@ class World:
         reaction = [-x for x in self.reaction]  # the world on the tool, not the sensor
         return np.array(
             [
-                *(self.tick, self.tick * self.dt_s, self.drive.is_enabled, *UNUSED_7),
+                *(self.tick, self.tick * self.dt_s, self.drive.is_enabled, *self.tip_m, *UNUSED_4),
                 *self.q[:DOF],
                 *self.v[:DOF],
                 *self.drive.setpoint.tolist(),
@@ -262,6 +264,11 @@ class World:
         depths = [hit[2] * reach if hit[0] >= 0 else math.inf for hit in hits]
         for i in range(len(self.config.proximity)):
             self._proximity[i] = _nearest(depths[i * len(RAYS) : (i + 1) * len(RAYS)])
+
+    def happen(self, index: int, fraction: float) -> None:
+        """Apply an event of the cell file, or a fraction of its motion."""
+        begun = self._begun.setdefault(index, self.panel.base_from_panel)
+        panel_events.apply(self.panel, self.cell.file.simulation.events[index], begun, fraction)
 
     def truth(self, initial_s: float = 0.0) -> Truth:
         """Return the true states that the judge compares with.

@@ -45,6 +45,9 @@ def serve(pipe: Connection, images: mmap.mmap) -> None:
                 pipe.send(picture(world, request, images))
             case Op.TRUTH:
                 pipe.send(world.truth(float(request[1])))
+            case Op.EVENT:
+                world.happen(int(request[1]), float(request[2]))
+                pipe.send(None)
             case Op.CLOSE:
                 break
     world.close()

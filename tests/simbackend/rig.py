@@ -13,6 +13,7 @@ from hal.config import Cell, load_cell
 from hal.devices import Device
 from hal.registry import Context, Shared, connect
 from hal.simulated import Fault
+from hal.simulated_events import EventSection
 
 ROOT = Path(__file__).parents[2]
 BENCH = ROOT / "cells" / "bench.toml"
@@ -38,9 +39,12 @@ class SimCell:
 
 
 @contextmanager
-def sim_cell(path: Path = BENCH, *, seed: int = 11) -> Iterator[SimCell]:
-    """Yield a running cell."""
-    cell = SimCell(cell=load_cell(path, seed=seed))
+def sim_cell(path: Path = BENCH, *, seed: int = 11, events: tuple[EventSection, ...] = ()) -> Iterator[SimCell]:
+    """Yield a running cell, in whose world these events happen."""
+    loaded = load_cell(path, seed=seed)
+    simulation = loaded.file.simulation.model_copy(update={"events": events})
+    file = loaded.file.model_copy(update={"simulation": simulation})
+    cell = SimCell(cell=loaded.model_copy(update={"file": file}))
     try:
         yield cell
     finally:

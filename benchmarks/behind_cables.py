@@ -21,9 +21,8 @@ from hal.panel import PanelObject, Shown
 from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
 from service.evaluate import shown_of
-from service.operations.find_panel import locate
 from service.operations.inspect import close_ups, look_past
-from service.operations.locate import go_to_overview
+from service.operations.locate import go_to_overview, locate_from_overview
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
@@ -80,7 +79,7 @@ def open_session(cell: Cell, folder: Path) -> Iterator[Session]:
             )
         )
         go_to_overview(session)
-        locate(session)
+        locate_from_overview(session)
         yield session
     finally:
         runtime.close()

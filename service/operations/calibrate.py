@@ -21,8 +21,7 @@ from service.operations.calibrate_sensors import (
     scanner_stations,
     tool_joints,
 )
-from service.operations.find_panel import locate
-from service.operations.locate import go_to_overview
+from service.operations.locate import go_to_overview, locate_from_overview
 from service.operations.session import Session
 from service.operations.travel import kinematics, park
 from service.report.plots import stations_picture
@@ -89,7 +88,7 @@ def _measure(
         return measure_tool(session, device, request.poses)
     session.progress(0.02, "find the panel")
     go_to_overview(session)
-    locate(session)
+    locate_from_overview(session)
     if request.what == "scanner":
         return measure_scanner(session, device, request.poses)
     return measure_camera(

@@ -17,8 +17,7 @@ from manipulation import visiting_order
 from perception.vision import ObjectReading, answer_at, draw_annotated, merge_views, said, viewpoints
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
-from service.operations.find_panel import locate
-from service.operations.locate import go_to_overview
+from service.operations.locate import go_to_overview, locate_from_overview
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
@@ -234,7 +233,7 @@ def ensure_located(session: Session) -> None:
         return
     session.progress(0.1, "drive to the overview")
     go_to_overview(session)
-    locate(session.part(0.3, 1.0))
+    locate_from_overview(session.part(0.3, 1.0))
 
 
 def missing(readings: Iterable[ObjectReading], wanted: Iterable[PanelObject]) -> tuple[str, ...]:

@@ -8,18 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion import PixelObservation, PlaneObservation, depth_before, triangulate, with_common_errors
-from hal.errors import NotFound, PerceptionError
+from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject, Rim
 from perception.range import PlaneFit, fit_plane_near
 from perception.vision import PanelWay, RimView, find_rims, viewpoints
 from service.operations.acquisition import Look, Scan, scan
-from service.operations.find_panel import locate
+from service.operations.find_panel import Located, locate
 from service.operations.session import Session
 from service.operations.travel import go_to_camera_view, leave_the_panel
 from service.schema.mission_results import ObjectDepth
 from service.schema.requests import PanelPoseRequest
 from service.schema.results import PanelPoseResult, PlateInScanner, estimated
+
+FAR_SLACK_RATIO = 1.6  # a panel that is turned and nearer than expected needs more than its tolerance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,15 +33,39 @@ class ScannedPlane:
     observation: PlaneObservation
 
 
-def go_to_overview(session: Session) -> None:
-    """Drive the camera to a pose from which it sees the whole panel."""
+def go_to_overview(session: Session, *, slack_ratio: float = 0.6) -> None:
+    """Drive the camera to a pose from which it sees the whole panel.
+
+    Args:
+        slack_ratio: free space around a panel that is not located, as a share of the tolerance of its position. A panel
+            is rarely at the edge of its tolerance, and nearer images are sharper.
+    """
     known = session.world.base_from_panel
     if known is None:
         leave_the_panel(session)
-    slack_m = 0.01 if known is not None else 0.6 * session.cell.file.workspace.position_tolerance_m
+    slack_m = 0.01 if known is not None else slack_ratio * session.cell.file.workspace.position_tolerance_m
     pose = session.believed_panel().parent_from_child
     lens = session.lens()
     go_to_camera_view(session, viewpoints.overview_poses(pose, session.panel, lens, slack_m), name="overview")
+
+
+def locate_from_overview(session: Session, by: PanelWay | None = None) -> Located:
+    """Find the panel from the overview, and once more from farther away if a part of it may be outside of the image.
+
+    Raises:
+        NotFound, Ambiguous, PerceptionError: see `locate`.
+    """
+    try:
+        return locate(session, by)
+    except NotFound as lost:
+        if session.world.base_from_panel is not None:
+            raise
+        session.progress(0.3, "look from farther away", lost.what)
+        try:
+            go_to_overview(session, slack_ratio=FAR_SLACK_RATIO)
+        except Unreachable:
+            raise lost from None
+        return locate(session, by)
 
 
 def scan_plate(session: Session) -> ScannedPlane:
@@ -168,7 +194,8 @@ def run_panel_pose(session: Session, request: PanelPoseRequest) -> PanelPoseResu
     if request.move:
         session.progress(0.05, "drive to the overview")
         go_to_overview(session)
-    found = locate(session, None if request.by is None else PanelWay(request.by))
+    by = None if request.by is None else PanelWay(request.by)
+    found = locate_from_overview(session, by) if request.move else locate(session, by)
     plate = None
     if request.scan:
         session.progress(0.9, "scan the plate")

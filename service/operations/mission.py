@@ -25,6 +25,7 @@ from service.operations.locate import (
     ScannedPlane,
     SeenRim,
     go_to_overview,
+    locate_from_overview,
     object_depths,
     rim_observations,
     rims_in,
@@ -181,7 +182,7 @@ def _find(session: Session, record: MissionRecord, tolerance: PoseTolerance) -> 
         session.world.forget()  # a mission uses only its own observations, because the panel may have been exchanged
         go_to_overview(part)
     with _step(session, "lights" if PanelWay.LIGHTS in ways_of(session) else "find the panel", 0.06, 0.10) as part:
-        found = _Found(views=(locate(part),))
+        found = _Found(views=(locate_from_overview(part),))
     if session.cell.names_of(DeviceKind.RANGE_SCANNER):
         with _step(session, "scan", 0.10, 0.13) as part:
             part.progress(0.0, "scan the plate")

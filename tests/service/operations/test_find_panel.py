@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
+from benchmarks.behind_cables import open_session
 from benchmarks.panel_ways import with_tags
 from hal.config import Cell, load_cell
 from hal.errors import InvalidRequest, NotFound
@@ -42,6 +44,19 @@ def cell_without_lights() -> Cell:
     devices = {name: section for name, section in cell.file.devices.items() if name != "panel_lights"}
     file = cell.file.model_copy(update={"devices": devices})
     return cell.model_copy(update={"panel": with_tags(cell.panel), "file": file})
+
+
+def test_a_panel_that_is_partly_outside_of_the_image_is_looked_at_from_farther_away(tmp_path: Path) -> None:
+    cell = load_cell(ROOT / "cells/bench.toml", seed=14)  # 0.1 m to the side, nearer, and turned by 15 degrees
+    simulation = cell.file.simulation.model_copy(update={"panel_spread_m": 0.1, "panel_spread_rad": 0.2618})
+    cell = cell.model_copy(update={"file": cell.file.model_copy(update={"simulation": simulation})})
+    with open_session(cell, tmp_path) as session:
+        truth = RigidTransform.from_matrix(session.context.connection.device("arm").truth().base_from_panel_matrix)
+        assert np.linalg.norm(difference(truth, session.known_panel().parent_from_child)[:3]) < 0.01
+        session.world.forget()
+        go_to_overview(session)
+        with pytest.raises(NotFound, match="light 2 is not seen"):
+            locate(session)
 
 
 @pytest.fixture(scope="module")

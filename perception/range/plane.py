@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,11 +13,13 @@ from perception.range.analysis import checked_depth
 from perception.range.features import RangeFeature, plane_feature
 from perception.range.fitting.surfaces import PLANE, SIZE
 from perception.range.noise import NoiseModel, estimate_noise
-from perception.range.primitives import Surface
+from perception.range.plate_fit import fit_plate
+from perception.range.primitives import Surface, primitive_of
 from perception.range.segmentation.finish import refine_surface
 from perception.range.segmentation.grid import Grid, block_size, build_grid
 from perception.range.segmentation.regions import regions_of
 from perception.range.sensor import RangeSensorModel
+from perception.range.sweep import SweptMount
 
 HYPOTHESES = 24  # seeds whose planes are tried, per direction of the normal
 INLIER_SIGMAS = 3.0
@@ -53,6 +55,7 @@ def fit_plane_near(
     sigma_offset_m: float = 0.02,
     sigma_angle_rad: float = 0.1,
     noise: NoiseModel | None = None,
+    swept: SweptMount | None = None,
 ) -> PlaneFit:
     """Fit the largest plane that agrees with an expected one within three standard deviations.
 
@@ -63,6 +66,7 @@ def fit_plane_near(
         point_m, normal: (3,) expected plane in the sensor frame; the normal may point either way.
         sigma_offset_m, sigma_angle_rad: standard deviations of the expectation.
         noise: noise model to use instead of an estimate from the image.
+        swept: mount of the line scanner from whose sweep the image was put together.
 
     Raises:
         InvalidRequest: the image, sensor or expectation is not usable.
@@ -89,7 +93,7 @@ def fit_plane_near(
     )
     if plane is None:
         raise _nothing_near(sigma_offset_m, sigma_angle_rad)
-    return _fitted(depth, sensor, law, plane)
+    return _fitted(depth, sensor, law, plane, swept)
 
 
 def _checked_expectation(
@@ -180,7 +184,9 @@ def _refitted(points: Array, sigma: Array, plane: Array, sigma_angle_rad: float)
     return plane, int(inside.sum()) * thin
 
 
-def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Array) -> PlaneFit:
+def _fitted(
+    depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Array, swept: SweptMount | None
+) -> PlaneFit:
     """Fit a plane (4,) to all pixels near it, and collect the result.
 
     Raises:
@@ -195,6 +201,13 @@ def _fitted(depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Ar
             inliers = np.abs(points @ th[:3] - th[3]) <= INLIER_SIGMAS * sigma
         own = regions_of(depth, sensor.packed(), noise.packed(), inliers.astype(np.int32), 1)
         surface, th = refine_surface(1, PLANE, th, own, 1, noise=noise)
+    refined = fit_plate(
+        points, sigma, normal=th[:3], offset_m=th[3], frame=surface.frame, gate=INLIER_SIGMAS, swept=swept
+    )
+    if refined is not None:
+        th[:4] = [*refined.normal, refined.offset_m]
+        plate = primitive_of(PLANE, th, surface.middle_m)
+        surface = replace(surface, primitive=plate, frame=refined.frame, covariance=refined.covariance)
     valid = int(np.isfinite(depth).sum())
     share = float(inliers.sum()) / valid
     if share < LEAST_SHARE:

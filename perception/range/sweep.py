@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 from hal.arrays import Array
 from hal.devices import RangeImage, RangeScannerCapabilities
 from hal.errors import InvalidRequest, NotFound, StaleReading
+from hal.geometry import UncertainPose, matrix_of
 from hal.readings import Quality, Stamped
 from perception.range.from_points import image_from_points
 from perception.range.sensor import PinholeSensor
@@ -84,6 +85,35 @@ class SweepPass:
         if not sum(len(times_s) for _, times_s in beams):
             return np.empty((0, 3))
         return self.track.in_base(np.concatenate([b[0] for b in beams]), np.concatenate([b[1] for b in beams]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SweptMount:
+    """What an error of the scanner's mount does to the image of a sweep beyond what it does to a range camera's image.
+
+    With the error (d, r) of the mount a range camera sees each point X shifted by d + r x X. In a sweep the error turns
+    with the scanner, by the angle a about its x axis at which X was seen, so there is, to first order, in addition
+
+    (R(a) - 1) d + ((R(a) - 1) r) x X,   a = atan2(-y, z)
+
+    Attributes:
+        covariance: (6, 6) of (d, r), m and rad, in the axes of the scanner as it stood before the sweep.
+    """
+
+    covariance: Array
+
+    @classmethod
+    def of(cls, mount: UncertainPose) -> SweptMount:
+        """Return it for a mount, whose covariance is in the axes of the flange."""
+        turn = np.kron(np.eye(2), matrix_of(mount.parent_from_child).T)
+        return cls(covariance=turn @ mount.covariance @ turn.T)
+
+    def distances(self, points_m: Array, normal: Array) -> Array:
+        """Return by how much points (N, 3) move along `normal` (3,), per unit of the error (N, 6)."""
+        turned = Rotation.from_rotvec(np.outer(np.arctan2(-points_m[:, 1], points_m[:, 2]), [1.0, 0.0, 0.0]))
+        back = turned.inv()
+        across = np.cross(points_m, normal)
+        return np.hstack([back.apply(normal) - normal, back.apply(across) - across])
 
 
 def image_from_sweep(

@@ -57,13 +57,14 @@ class LightPair:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scan:
-    """One range image (float32 metres, NaN where nothing was measured) and the pose of the scanner."""
+    """One range image (float32 metres, NaN where nothing was measured), perhaps swept, and the pose of the scanner."""
 
     depth_m: NDArray[np.float32]
     stamp_s: float
     scanner: str
     capabilities: RangeScannerCapabilities
     base_from_scanner: UncertainPose
+    is_swept: bool = False
 
     def pinhole(self) -> PinholeSensor:
         """Return the scanner's model.
@@ -166,6 +167,7 @@ def scan(session: Session) -> Scan:
             scanner=name,
             capabilities=swept.capabilities,
             base_from_scanner=base_from(session, name),
+            is_swept=True,
         )
     asked_s = session.connection.clock.now_s()
     sample = device.read_range(deadline=deadline())

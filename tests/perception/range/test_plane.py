@@ -49,6 +49,31 @@ def test_errors_match_the_covariance():
     assert (mean > 0.6).all() and (mean < 1.6).all(), mean
 
 
+def plate_with_labels(seed: int, height_m: float) -> np.ndarray:
+    """Return a scan of a plate with twelve labels that stand out by about the noise of one pixel."""
+    depth = plane_depth(PINHOLE, NORMAL, POINT).copy()
+    rng = np.random.default_rng(seed)
+    for row, column in rng.integers(8, [depth.shape[0] - 24, depth.shape[1] - 24], (12, 2)):
+        depth[row : row + 14, column : column + 14] -= height_m
+    return noisy(depth, 0.0008, seed, gross=0.02)
+
+
+def test_labels_that_no_pixel_shows_neither_turn_the_plane_nor_leave_its_covariance_too_small():
+    squares = []
+    for seed in range(40):
+        f = fit_plane_near(plate_with_labels(seed, 0.001), PINHOLE, point_m=POINT, normal=NORMAL).feature
+        turn = np.cross(f.direction, NORMAL)
+        squares.append(
+            [
+                ((f.point_m - POINT) @ NORMAL / f.sigma_point_m) ** 2,
+                turn @ np.linalg.pinv(f.direction_covariance, rcond=1e-6) @ turn / 2,
+            ]
+        )
+    offset, tilt = np.mean(squares, axis=0)
+    assert 0.5 < tilt < 2.0
+    assert offset < 4.0
+
+
 def test_nothing_near_is_said():
     with pytest.raises(NotFound):
         fit_plane_near(panel_with_a_lamp(1), PINHOLE, point_m=[0, 0, 1.5], normal=NORMAL)

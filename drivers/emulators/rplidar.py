@@ -29,12 +29,16 @@ class RplidarEmulatorOptions(FaultOptions):
     scan_rate_hz: Annotated[float, Field(gt=0, le=50)] = 10.0
     nodes: Annotated[int, Field(ge=36, le=3600)] = 360
     bursts: Annotated[int, Field(ge=1, le=360, description="pieces in which a revolution is sent; faults hit one")] = 1
+    is_rotating: Annotated[
+        bool,
+        Field(description="each burst is measured when it is sent; otherwise the revolution at its start, all at once"),
+    ] = False
     health: Annotated[int, Field(ge=0, le=2)] = 0
     is_cured_by_reset: bool = True
 
 
 class RplidarEmulator(WireEmulator):
-    """Running emulator of the scanner; it measures a revolution at its start, and sends it in bursts."""
+    """Running emulator of the scanner; it sends each revolution in bursts."""
 
     def __init__(self, backing: RangeScanner, options: RplidarEmulatorOptions) -> None:
         super().__init__(PtyPort("rplidar"), options, name="rplidar")
@@ -45,6 +49,7 @@ class RplidarEmulator(WireEmulator):
         self.is_scanning = self.is_express = self._is_first = False
         self._buffer = b""
         self._unsent: list[bytes] = []
+        self._sent_ratio = self._step_ratio = 0.0  # of the present revolution; of one burst
 
     def on_bytes(self, peer: Peer, data: bytes) -> None:
         """Answer the requests; each is `A5 command`, some with a payload."""
@@ -83,10 +88,15 @@ class RplidarEmulator(WireEmulator):
         if not self.is_scanning:
             self._unsent = []
             return
-        if not self._unsent:
+        begun = self._sent_ratio if self._unsent else 0.0
+        # A rotating head measures as it goes; behind it, from a quarter to three quarters, the backing device sees nothing.
+        if begun == 0.0 or (self._o.is_rotating and not 0.25 < begun < 0.75 - self._step_ratio):
             turn, unit = self._turn(), CAPSULE_BYTES if self.is_express else NODE_BYTES
             size = -(-len(turn) // unit // self._o.bursts) * unit
-            self._unsent = [turn[at : at + size] for at in range(0, len(turn), size)]
+            pieces = [turn[at : at + size] for at in range(0, len(turn), size)]
+            self._unsent = pieces[round(begun * len(pieces)) :]
+            self._step_ratio = 1.0 / len(pieces)
+        self._sent_ratio = begun + self._step_ratio
         self.send(None, self._unsent.pop(0), protected=slice(None) if self.is_express else slice(0, 0))
 
     def _turn(self) -> bytes:

@@ -16,8 +16,6 @@ from hal.panel.turn import Turns
 
 RIGHT_RAD = 0.105
 """Tolerance within which a wheel counts as read or turned correctly: 6 degrees, in radians."""
-HUB_RADIUS_M = 0.009
-SPOKE_RADIUS_M = 0.003
 
 
 class Handwheel(PanelObject):
@@ -31,6 +29,8 @@ class Handwheel(PanelObject):
     minimum_rad: Turns = -6.2832
     maximum_rad: Turns = 6.2832
     torque_nm: Positive = 0.8
+    hub_m: Annotated[Positive, Field(description="radius of the hub")] = 0.009
+    spoke_m: Annotated[Positive, Field(description="half the thickness of a spoke")] = 0.003
 
     value_is_angle: ClassVar[bool] = True
     asked: ClassVar[tuple[Question, ...]] = (Question(key="spokes", text="How many spokes?", default="3"),)
@@ -84,13 +84,13 @@ class Handwheel(PanelObject):
             "size_m": self.radius_m,
             "tube_m": self.rim_m,
         }
-        hub = {"type": "plane", "point_m": [0, 0, self.height_m], "direction": up, "size_m": HUB_RADIUS_M}
+        hub = {"type": "plane", "point_m": [0, 0, self.height_m], "direction": up, "size_m": self.hub_m}
         rows: list[dict[str, Any]] = [{"name": "rim", **rim}, {"name": "hub", **hub}]
         for k in range(self.spokes):
             angle = 0.5 * math.pi - 2.0 * math.pi * k / self.spokes  # the first points up, as the file counts angles
             x, y = math.cos(angle), math.sin(angle)
             middle = [0.5 * self.radius_m * x, 0.5 * self.radius_m * y, ring_m]
-            size = {"size_m": SPOKE_RADIUS_M, "length_m": self.radius_m}
+            size = {"size_m": self.spoke_m, "length_m": self.radius_m}
             rows.append(
                 {"name": f"spoke_{k + 1}", "type": "cylinder", "point_m": middle, "direction": [x, y, 0.0], **size}
             )

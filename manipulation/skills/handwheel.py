@@ -1,47 +1,64 @@
-"""Turns a handwheel: holds its rim lightly between two spokes and carries it about the hub."""
+"""Turns a handwheel by pushing two spokes, or by holding the rim beside a spoke, as often as the angle needs it."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from hal.arrays import Array
-from hal.errors import InvalidRequest
-from hal.motion import Compliance, Guard, Quantity
+from hal.errors import InvalidRequest, Unreachable
 from hal.panel import Handwheel
-from manipulation.planning.cartesian_path import arc
+from manipulation.planning.hand import Hand
 from manipulation.skills.attempt import STANDOFF_M, Attempt
-from manipulation.skills.contact import against_turn, centre_between
+from manipulation.skills.contact import centre_between
 from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.crank import SpokeHold, spoke_holds
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.repeat import perform
+from manipulation.skills.wheel_turn import LAG_RAD, WheelTurn
 
-HUB_M = 0.009  # generous radius of the hub, which the panel file does not give
-SIDE_M = 0.009  # largest free space between each finger and the rim when approaching
+TIP_DEPTH_M = 0.014  # depth of the tips below the middle of the spokes
+RIM_DEPTH_M = 0.008  # the same below the middle of the rim
+HOLDS_RAD = (
+    4.2,
+    2.6,
+    1.3,
+)  # largest turns of one hold that are tried, in this order; the arm's wrist allows one of them
+RIM_HOLDS_RAD = (1.7, 0.9)
+PUSH_N = 46.0  # of one finger on a spoke; the soft pads of the bench slip past it at 55 N
+STATED_RATIO = 1.3  # a stated effort that is this far beyond what the spokes take is believed without trying
+SIDE_N = 85.0  # of the hand on the rim
+RIM_SIDE_M = 0.009  # largest free space between each finger and the rim when approaching
 SPARE_M = 0.001
-TIP_DEPTH_M = 0.008  # depth of the tips below the middle of the rim
-FRICTION = 0.6  # coefficient of the pads on paint; the low value makes the grip firm enough
-FIRMER_RATIO = 1.4  # the first grasp is light, because a firm one caused 97 N of friction along the fingers
-GRIP_FLOOR_N = 12.0
-LARGEST_GRIP_N = 45.0
-TURN_M_PER_S = 0.08
-LONGEST_RAD = 1.7  # largest turn of one grasp; then the hand goes back for the next
-EFFORT_SPREAD = 1.6
-EFFORT_FLOOR_N = 30.0
-LARGEST_STOP_N = 92.0
+SPOKE_GAP_M = 0.0025  # between the inner finger and the spoke beside which it holds the rim
+FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
+GRIP_N = (20.0, 50.0)  # smallest and largest force of the pads; above 60 N the soft pads of the bench slip over the rim
 TOLERANCE_RAD = np.radians(6.0)
-INF = float("inf")
-# Hub and plate are known only to a few millimetres, so the hand is compliant along the radius and the axis, and the rim
-# guides it.
-RADIAL = Compliance(
-    stiffness=(50.0, INF, 400.0, INF, INF, INF),
-    damping=(1000.0, 1000.0, 1500.0, 10.0, 10.0, 10.0),
-    mass=(100.0, 100.0, 100.0, 1.0, 1.0, 1.0),
-    max_offset_m=0.015,
-)
+AT_STOP_RAD = 0.35
+TURN_RAD = 2.0 * np.pi
+
+
+@dataclass(slots=True, kw_only=True)
+class _Belief:
+    """What is believed of the wheel's effort: the panel file's, then the felt one."""
+
+    effort_nm: float
+    is_felt: bool = False
+
+    def suits(self, holds: tuple[SpokeHold, ...]) -> bool:
+        """Return whether two fingers on the spokes may turn it."""
+        if not holds:
+            return False
+        spread = 1.0 if self.is_felt else STATED_RATIO
+        return self.effort_nm < spread * 2.0 * PUSH_N * holds[0].arm_m
+
+    def feel(self, effort_nm: float) -> None:
+        """Take over an effort that was felt: it moves the wheel, or is the least that does."""
+        self.effort_nm, self.is_felt = effort_nm, True
 
 
 def handwheel(
@@ -54,11 +71,11 @@ def handwheel(
 ) -> SkillReport:
     """Turn the wheel until its marked spoke has come from the present angle to `target_rad` (clockwise from up).
 
-    A turn of more than about 100 degrees takes several grasps. The mechanical estimate in the report is the angle
-    reached.
+    A turn of more than about 240 degrees takes several holds. A look shows the angle within one turn only, so the whole
+    turns are tracked from what was done and felt. The mechanical estimate in the report is the angle reached.
 
     Args:
-        current: what the last observation showed (angle); without it `verify` is asked.
+        current: what the last observation showed (angle, and whole turns if known); without it `verify` is asked.
         verify: the caller's read-back.
 
     Raises:
@@ -71,16 +88,15 @@ def handwheel(
             f"{target_rad:.2f} rad is beyond the stops of {name}",
             hint=f"{wheel.minimum_rad:.2f} to {wheel.maximum_rad:.2f} rad",
         )
-    where = InitialState(lambda seen: seen.angle_rad, what=f"the angle of {name}", current=current, verify=verify)
-    tries = itertools.count()
+    where = InitialState(
+        lambda seen: seen.angle_rad, what=f"the angle of {name}", current=current, verify=verify, period=TURN_RAD
+    )
+    belief = _Belief(effort_nm=wheel.torque_nm)
 
     def stroke(attempt: Attempt) -> float:
-        grip_n = grip_force_n(wheel, tries=next(tries))
-        angle_rad = where.known
-        while abs(target_rad - angle_rad) > 0.3 * TOLERANCE_RAD:
-            part = float(np.clip(target_rad - angle_rad, -LONGEST_RAD, LONGEST_RAD))
-            angle_rad = where.moved_to(angle_rad + _carry(attempt, wheel, angle_rad, part, grip_n))
-        return angle_rad
+        while abs(target_rad - where.known) > 0.3 * TOLERANCE_RAD:
+            _turn_once(attempt, wheel, where, belief, target_rad - where.known)
+        return where.known
 
     return perform(
         context,
@@ -88,79 +104,150 @@ def handwheel(
         skill="handwheel",
         object_name=name,
         target=f"{target_rad:.3f} rad",
-        is_reached=lambda seen: surely_within(seen.angle_rad, target_rad, TOLERANCE_RAD, sigma=seen.sigma),
+        is_reached=lambda seen: surely_within(where.known, target_rad, TOLERANCE_RAD, sigma=seen.sigma),
         verify=where.verify,
     )
 
 
-def grip_force_n(wheel: Handwheel, *, tries: int = 0) -> float:
-    """Return the force of each pad with which friction carries the wheel, 2 mu F r = torque; firmer after each slip."""
-    needed = wheel.torque_nm / (2.0 * FRICTION * wheel.radius_m)
-    return float(np.clip(needed * FIRMER_RATIO**tries, GRIP_FLOOR_N, LARGEST_GRIP_N))
+def _turn_once(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: _Belief, span_rad: float) -> None:
+    """Turn the wheel in one hold as far as the arm can, and leave.
+
+    Raises:
+        SkillFailure: a finger landed on the wheel, it did not give way, it met an end stop, or the fingers slipped.
+        Unreachable: the arm cannot turn its hand about this hub.
+    """
+    holds = spoke_holds(wheel, attempt.context.hand, where.known, float(np.sign(span_rad)))
+    by_spokes = belief.suits(holds)
+    turn, part_rad = (
+        _behind_spokes(attempt, wheel, holds, span_rad) if by_spokes else _at_the_rim(attempt, wheel, where.known, span_rad, belief)
+    )  # fmt: skip
+    angle_rad, sign = where.known, float(np.sign(span_rad))
+    try:
+        turn.turn(part_rad)
+        where.moved_to(angle_rad + sign * turn.moved_rad)
+        belief.feel(turn.felt_nm)
+    except SkillFailure as failure:
+        where.moved_to(_at_a_stop(wheel, angle_rad + sign * turn.moved_rad, sign, failure.outcome))
+        failure.reached = where.known
+        belief.feel(turn.felt_nm)
+        if not by_spokes or failure.outcome is not Outcome.STIFF:
+            raise
+    finally:
+        turn.let_go()
 
 
-def free_side_m(wheel: Handwheel, finger_m: float) -> float:
+def _behind_spokes(
+    attempt: Attempt, wheel: Handwheel, holds: tuple[SpokeHold, ...], span_rad: float
+) -> tuple[WheelTurn, float]:
+    """Bring the fingers behind two spokes; returns the hold and the part of the turn that it allows."""
+    sign = float(np.sign(span_rad))
+    low = wheel.height_m - wheel.rim_m - TIP_DEPTH_M
+
+    def way(hold: SpokeHold, part: float, flip: int) -> list[RigidTransform]:
+        end = sign * (hold.behind_rad + LAG_RAD + part)
+        above = hold.grip(wheel, 0.0, wheel.height_m + STANDOFF_M, flip=bool(flip))
+        return [above, *(hold.grip(wheel, a, low, flip=bool(flip)) for a in _steps(end))]
+
+    width = holds[0].opening_m(attempt.context.hand)
+    index, part = _begin(
+        attempt, wheel, span_rad, HOLDS_RAD, width,
+        lambda part: [way(hold, part, flip) for hold in holds for flip in (0, 1)],
+    )  # fmt: skip
+    _come_down(attempt, wheel, TIP_DEPTH_M)
+    hold = holds[index // 2]
+    turn = WheelTurn(
+        attempt=attempt, wheel=wheel, sign=sign, behind_rad=hold.behind_rad, most_nm=2.0 * PUSH_N * hold.arm_m,
+        up_m=STANDOFF_M + wheel.rim_m + TIP_DEPTH_M,
+    )  # fmt: skip
+    return turn, part
+
+
+def _at_the_rim(
+    attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float, belief: _Belief
+) -> tuple[WheelTurn, float]:
+    """Hold the rim between the fingers, the inner one just behind a spoke, which takes over where the pads slip."""
+    hand, sign = attempt.context.hand, float(np.sign(span_rad))
+    side = free_side_m(wheel, hand)
+    inner = wheel.radius_m - wheel.rim_m - side - hand.finger_thickness_m / 2
+    behind = float(np.arcsin(min(1.0, (hand.finger_width_m / 2 + wheel.spoke_m + SPOKE_GAP_M) / inner)))
+    places = [angle_rad + 2.0 * np.pi * k / wheel.spokes - sign * behind for k in range(wheel.spokes)]
+    low, top = wheel.height_m - wheel.rim_m - RIM_DEPTH_M, wheel.height_m + STANDOFF_M
+
+    def at(angle: float, z: float, flip: int) -> RigidTransform:
+        x, y = wheel.position_m
+        point = (x + wheel.radius_m * np.sin(angle), y + wheel.radius_m * np.cos(angle), z)
+        return panel_from_grip(
+            point, np.pi / 2 - angle + np.pi * flip
+        )  # the radius is at pi/2 - angle from the panel's x
+
+    def ways(part: float) -> list[list[RigidTransform]]:
+        steps = _steps(sign * (part + 0.3))
+        return [
+            [at(place, top, flip), *(at(place + a, low, flip) for a in steps)]
+            for place, flip in itertools.product(places, (0, 1))
+        ]
+
+    width = 2.0 * (wheel.rim_m + side)
+    _, part = _begin(attempt, wheel, span_rad, RIM_HOLDS_RAD, width, ways)
+    _come_down(attempt, wheel, RIM_DEPTH_M)
+    centre_between(attempt, room_m=2.0 * side, what="rim")
+    grip_n = float(np.clip(belief.effort_nm / (2.0 * FRICTION * wheel.radius_m), *GRIP_N))
+    left = attempt.grasp(grip_n, name="hold the rim")
+    if left < 0.4 * wheel.rim_m:
+        raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * left:.1f} mm; no rim between them")
+    turn = WheelTurn(
+        attempt=attempt, wheel=wheel, sign=sign, behind_rad=0.0, most_nm=SIDE_N * wheel.radius_m,
+        up_m=STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, open_m=width,
+    )  # fmt: skip
+    return turn, part
+
+
+def free_side_m(wheel: Handwheel, hand: Hand) -> float:
     """Return the free space on each side of the rim with which the rim is met before the hub.
 
     Moving inwards, the outer finger meets the rim at radius R - side, the inner one the hub at hub + finger + rim +
     side.
     """
-    most = 0.5 * (wheel.radius_m - wheel.rim_m - HUB_M - finger_m - SPARE_M)
-    return float(np.clip(most, 0.003, SIDE_M))
+    most = 0.5 * (wheel.radius_m - wheel.rim_m - wheel.hub_m - hand.finger_thickness_m - SPARE_M)
+    return float(np.clip(most, 0.003, RIM_SIDE_M))
 
 
-def _carry(attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float, grip_n: float) -> float:
-    """Hold the rim once and turn it; returns the signed angle by which the wheel turned."""
-    context, sign = attempt.context, float(np.sign(span_rad))
-    side_m = free_side_m(wheel, context.hand.finger_thickness_m)
-    open_m = 2.0 * (wheel.rim_m + side_m)
-    gap = np.pi / wheel.spokes
-    between = [angle_rad + (2 * k + 1) * gap for k in range(wheel.spokes)]
-    ways = [_way(wheel, place, span_rad, flip) for place in between for flip in (0.0, np.pi)]
-    way = attempt.begin(ways, may_touch=(wheel.name,), width_m=open_m, name=wheel.name)
-    down = attempt.advance(STANDOFF_M + wheel.rim_m + TIP_DEPTH_M, name="approach")
+def _begin(
+    attempt: Attempt,
+    wheel: Handwheel,
+    span_rad: float,
+    longest_rad: tuple[float, ...],
+    width_m: float,
+    ways: Callable[[float], list[list[RigidTransform]]],
+) -> tuple[int, float]:
+    """Go to the standoff of the way that allows the largest part of the turn; returns its index and that part."""
+    parts = sorted({min(abs(span_rad), longest) for longest in longest_rad}, reverse=True)
+    for part in parts:
+        try:
+            return attempt.begin(ways(part), may_touch=(wheel.name,), width_m=width_m, name=wheel.name), part
+        except Unreachable:
+            if part == parts[-1]:
+                raise
+    raise AssertionError("there is a longest hold")
+
+
+def _come_down(attempt: Attempt, wheel: Handwheel, depth_m: float) -> None:
+    down = attempt.advance(STANDOFF_M + wheel.rim_m + depth_m, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the wheel")
-    centre_between(attempt, room_m=2.0 * side_m, what="rim")
-    hub = _hub(attempt, wheel, between[way // 2])
-    width = attempt.grasp(grip_n, name="hold the rim")
-    if width < wheel.rim_m:
-        raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no rim between them")
-    start = attempt.pose()
-    axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
-    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * wheel.torque_nm / wheel.radius_m + EFFORT_FLOOR_N)
-    against = against_turn(start, hub, sign * axis)
-    guard = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)
-    # Angle lost because both pads yield.
-    lag = wheel.torque_nm / (2.0 * context.hand.pad_stiffness_n_per_m * wheel.radius_m**2)
-    poses = arc(start, centre_m=hub, axis=axis, angle_rad=span_rad + sign * lag)
-    report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=RADIAL)
-    turned = sign * float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
-    if report.tripped is not None:
-        outcome = Outcome.STIFF if abs(turned) < 0.2 else Outcome.STALLED
-        raise SkillFailure(outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=angle_rad + turned)
-    attempt.open_to(open_m, name="let go")
-    attempt.leave(STANDOFF_M + wheel.rim_m + TIP_DEPTH_M)
-    return turned - sign * lag
 
 
-def _hub(attempt: Attempt, wheel: Handwheel, place_rad: float) -> Array:
-    """Return the hub in the base frame: its place by the panel's pose, corrected radially by where the rim was felt."""
-    panel = attempt.context.panel_pose
-    tool = (panel.inv() * attempt.pose()).translation
-    radial = np.array([np.sin(place_rad), np.cos(place_rad), 0.0])
-    offset = (tool - np.array(wheel.point_m)) @ radial - wheel.radius_m
-    return np.asarray(panel.apply(np.array(wheel.point_m) + offset * radial + [0.0, 0.0, tool[2]]))
+def _steps(end_rad: float) -> list[float]:
+    return [float(a) for a in np.linspace(0.0, end_rad, max(6, int(abs(end_rad) / 0.15)))]
 
 
-def _way(wheel: Handwheel, start_rad: float, span_rad: float, flip: float) -> list[RigidTransform]:
-    """Return grip poses with the closing direction along the radius, from the standoff to the end of the turn."""
+def _at_a_stop(wheel: Handwheel, angle_rad: float, sign: float, outcome: Outcome) -> float:
+    """Return the angle of a wheel that stopped turning, with its whole turns corrected if it can only be an end stop.
 
-    def at(angle: float, z: float) -> RigidTransform:
-        x, y = wheel.position_m
-        point = (x + wheel.radius_m * np.sin(angle), y + wheel.radius_m * np.cos(angle), z)
-        return panel_from_grip(point, np.pi / 2 - angle + flip)  # the radius points at pi/2 - angle from the panel's x
-
-    low = wheel.height_m - wheel.rim_m - TIP_DEPTH_M
-    steps = np.linspace(start_rad, start_rad + span_rad, max(6, int(abs(span_rad) / 0.08)))
-    return [at(start_rad, wheel.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]
+    A wheel that stops at the angle of its end stop, but whole turns before it, was not in the turn that was assumed.
+    """
+    stop = wheel.maximum_rad if sign > 0 else wheel.minimum_rad
+    turns = round((stop - angle_rad) / TURN_RAD)
+    if outcome is Outcome.STALLED and turns != 0 and abs(stop - angle_rad - turns * TURN_RAD) < AT_STOP_RAD:
+        return angle_rad + turns * TURN_RAD
+    return angle_rad

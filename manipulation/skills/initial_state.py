@@ -16,6 +16,7 @@ class InitialState:
         what: name of the quantity, for people.
         current: what the last observation showed; without it `verify` is asked.
         verify: the caller's read-back.
+        period: observations show the place up to multiples of this; the one nearest to what is known is taken.
     """
 
     def __init__(
@@ -25,10 +26,12 @@ class InitialState:
         what: str,
         current: ObjectState | None,
         verify: Verify | None,
+        period: float | None = None,
     ) -> None:
         self._place_of = place_of
         self._what = what
         self._verify = verify
+        self._period = period
         self._place: float | None = None
         if current is not None:
             self._place = place_of(current)
@@ -59,6 +62,8 @@ class InitialState:
     def _look(self) -> ObjectState | None:
         seen = self._verify() if self._verify is not None else None
         place = self._place_of(seen) if seen is not None else None
+        if place is not None and self._place is not None and self._period is not None:
+            place += self._period * round((self._place - place) / self._period)
         if place is not None:
             self._place = place
         return seen

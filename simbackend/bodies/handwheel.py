@@ -36,7 +36,7 @@ class HandwheelBody(Body[Handwheel]):
         ring_m = h - rim_m
         angles = np.linspace(0.0, 2 * np.pi, SEGMENTS + 1)
         points = [(r * math.sin(a), r * math.cos(a), ring_m) for a in angles]
-        parts = [shape(at(0, 0, h / 2 - 0.001), cylinder(0.009, h - 0.002), BLUE)]
+        parts = [shape(at(0, 0, h / 2 - 0.001), cylinder(panel_object.hub_m, h - 0.002), BLUE)]
         for a_m, b_m in pairwise(points):
             middle, length_m = along(a_m, b_m)
             parts.append(shape(middle, cylinder(rim_m, length_m + 0.0015), BLUE))
@@ -45,7 +45,7 @@ class HandwheelBody(Body[Handwheel]):
             end = (r * math.sin(angle), r * math.cos(angle), ring_m)
             middle, length_m = along((0, 0, ring_m), end)
             # The marked spoke is white and wider than the others, so that the angle can be seen.
-            colour, radius_m = (WHITE, 0.0036) if i == 0 else (BLUE, 0.003)
+            colour, radius_m = (WHITE, 1.2 * panel_object.spoke_m) if i == 0 else (BLUE, panel_object.spoke_m)
             parts.append(shape(middle, cylinder(radius_m, length_m), colour))
         limits = (panel_object.minimum_rad, panel_object.maximum_rad)
         urdf = moving(parts, kind="revolute", axis=(0, 0, -1), limits=limits, mass_kg=0.3, inertia_kg_m2=4e-4)

@@ -49,3 +49,15 @@ def test_a_look_corrects_what_the_tool_measured_and_one_that_tells_nothing_does_
     assert where.known == 3.5
     assert verify() == at(4.0)
     assert where.known == 4.0
+
+
+def test_a_look_that_shows_one_turn_only_does_not_change_the_whole_turns() -> None:
+    looks = iter([at(-0.4), at(3.0)])
+    where = InitialState(value_of, what="it", current=at(1.0), verify=lambda: next(looks), period=6.0)
+    assert where.verify is not None
+    where.moved_to(11.5)
+    where.verify()
+    assert where.known == 11.6
+    where.moved_to(-8.8)
+    where.verify()
+    assert where.known == -9.0

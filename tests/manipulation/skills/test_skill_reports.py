@@ -28,7 +28,6 @@ from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.button import button
 from manipulation.skills.context import SkillContext
-from manipulation.skills.handwheel import GRIP_FLOOR_N, LARGEST_GRIP_N, grip_force_n
 from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport
 from manipulation.skills.press import stop_force_n, travelled_m
@@ -284,13 +283,6 @@ def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_
     with pytest.raises(MotionError, match="to park: 114 N") as caught:
         park(replace(context, park_rad=HOME + 0.05))
     assert mover.asked[-1] == "to park" and "in the way" in caught.value.hint
-
-
-def test_a_wheel_that_slipped_is_held_more_firmly_up_to_what_a_hand_may() -> None:
-    wheel = next(panel_object for panel_object in PANEL.objects if panel_object.kind == "handwheel")
-    forces = [grip_force_n(wheel, tries=k) for k in range(20)]
-    assert forces == sorted(forces) and forces[0] < forces[3]
-    assert forces[0] >= GRIP_FLOOR_N and forces[-1] == LARGEST_GRIP_N
 
 
 def _turned(name: str, target: str, now: ObjectState, seen: ObjectState) -> Outcome:

@@ -1,0 +1,88 @@
+"""What a hand feels when it turns something: when the object gives way, at which effort, and how far it has moved.
+
+The pads yield, so the hand is ahead of the object: first the torque rises with the turn of the hand, and where it rises
+no more, the object has given way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hal.arrays import Array
+
+STEP_RAD = 0.01
+WINDOW = 4  # steps over which a slope is taken
+FLAT_RATIO = 0.3  # of the steepest slope: below it the object moves
+LEAST_NM = 0.06  # above noise, drift and the hand's own inertia
+SLIP_RATIO = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Felt:
+    """Torques that a hand felt in one hold.
+
+    Attributes:
+        turned_rad, torque_nm: turns of the hand (N,) since it came down, and the torques (N,) against them.
+        is_moving: whether the object has given way.
+        running_nm: torque at which it moves.
+        moved_rad: how far it has turned.
+        has_slipped: whether the torque has fallen from what moved the object.
+    """
+
+    turned_rad: Array = field(default_factory=lambda: np.zeros(1))
+    torque_nm: Array = field(default_factory=lambda: np.zeros(1))
+    is_moving: bool = False
+    running_nm: float = 0.0
+    moved_rad: float = 0.0
+    has_slipped: bool = False
+
+    @property
+    def end_rad(self) -> float:
+        """Turn of the hand at the end."""
+        return float(self.turned_rad[-1])
+
+    @property
+    def peak_nm(self) -> float:
+        """Largest torque."""
+        return float(self.torque_nm.max())
+
+
+def felt_in(before: Felt, turned_rad: Array, torque_nm: Array) -> Felt:
+    """Return what was felt in a hold after one more motion of it."""
+    turned = np.concatenate([before.turned_rad, turned_rad])
+    torque = np.concatenate([before.torque_nm, torque_nm])
+    ahead = np.maximum.accumulate(turned)
+    grid = np.arange(0.0, ahead[-1], STEP_RAD)
+    unknown = Felt(turned_rad=turned, torque_nm=torque)
+    if len(grid) <= WINDOW + 1:
+        return unknown
+    order = np.argsort(ahead, kind="stable")
+    level = np.interp(grid, ahead[order] + 1e-9 * np.arange(len(order)), torque[order])
+    level = np.array([np.median(level[max(0, k - 1) : k + 2]) for k in range(len(level))])
+    slopes = (level[WINDOW:] - level[:-WINDOW]) / (WINDOW * STEP_RAD)
+    gives = _breakaway(level, slopes)
+    end_nm = float(np.median(torque[-5:]))
+    if gives is None:
+        return Felt(turned_rad=turned, torque_nm=torque, has_slipped=end_nm < SLIP_RATIO * level.max() - LEAST_NM)
+    slope = float(slopes[:gives].max())
+    running = float(np.median(level[gives:][-30:]))
+    moved = ahead[-1] - grid[gives] - (end_nm - level[gives]) / slope
+    return Felt(
+        turned_rad=turned,
+        torque_nm=torque,
+        is_moving=True,
+        running_nm=running,
+        moved_rad=max(0.0, float(moved)),
+        has_slipped=end_nm < SLIP_RATIO * level.max() - LEAST_NM,
+    )
+
+
+def _breakaway(level_nm: Array, slopes: Array) -> int | None:
+    """Return the index at which a rising torque (N,) becomes flat; None when it does not."""
+    for k in range(1, len(slopes)):
+        steepest = float(slopes[:k].max())
+        if level_nm[k] > LEAST_NM and steepest > 0.5 and slopes[k] < FLAT_RATIO * steepest:
+            return k
+    return None

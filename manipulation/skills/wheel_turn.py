@@ -1,0 +1,176 @@
+"""One hold of a handwheel: turns the hand about the hub, and knows from the torque how far the wheel has followed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from hal.arrays import Array
+from hal.motion import Compliance, Guard, MotionReport, Quantity
+from hal.panel import Handwheel
+from manipulation.planning.cartesian_path import arc, through
+from manipulation.skills.attempt import Attempt
+from manipulation.skills.outcome import Outcome, SkillFailure
+from manipulation.skills.turning import Felt, felt_in
+
+TURN_M_PER_S = 0.08
+LAG_RAD = 0.8  # largest turn by which the hand is ahead of the wheel, because the pads yield
+FIRST_RAD = 0.5  # first part of a turn; it shows at which torque the wheel gives way
+NEXT_RAD = 0.3
+SHORTEST_RAD = np.radians(1.0)
+MOVED_RAD = 0.1  # a wheel that stops before is stiff, one that stops later has stalled
+LARGEST_SIDE_N = 85.0  # below the cell's protective limit
+STOP_RATIO, STOP_NM = 1.4, 0.35  # an end stop is a torque above this multiple of the felt one plus this much
+SLIP_RATIO, SLIP_TICKS = 0.4, 10
+LOG_SAMPLES = 300
+INF = float("inf")
+DAMPING = (1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0)
+MASS = (100.0, 100.0, 100.0, 1.0, 1.0, 1.0)
+MAX_OFFSET_M = 0.008
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class WheelTurn:
+    """A hand on a wheel, either behind two spokes or with the rim between its fingers.
+
+    Attributes:
+        sign: 1 turns clockwise.
+        behind_rad: turn of the hand before it meets the spokes; 0 with the rim between the fingers.
+        most_nm: largest torque that this hold takes.
+        up_m: how far the hand moves back to leave.
+        open_m: opening that releases the rim; None when nothing is held between the fingers.
+        moved_rad: how far the wheel has turned, not negative.
+    """
+
+    attempt: Attempt
+    wheel: Handwheel
+    sign: float
+    behind_rad: float
+    most_nm: float
+    up_m: float
+    open_m: float | None = None
+    moved_rad: float = 0.0
+    _felt: Felt = field(default_factory=Felt)
+    _side_n: tuple[float, float] = (0.0, 0.0)
+    _grip_from_hub: RigidTransform = field(init=False)
+
+    def __post_init__(self) -> None:
+        grip = self.attempt.pose()
+        hub = grip.inv().apply(self.attempt.context.panel_pose.apply([*self.wheel.position_m, 0.0]))
+        self._grip_from_hub = RigidTransform.from_translation([hub[0], hub[1], 0.0])
+
+    @property
+    def felt_nm(self) -> float:
+        """Torque that moved the wheel, or the largest that did not."""
+        return self._felt.running_nm if self._felt.is_moving else self._felt.peak_nm
+
+    def turn(self, span_rad: float) -> None:
+        """Turn the wheel by `span_rad` (not negative).
+
+        Raises:
+            SkillFailure: `stiff`, `stalled` or `slipped`.
+        """
+        start = self._tool()
+        goal_rad = self.behind_rad + min(FIRST_RAD, span_rad)
+        limit_rad = self.behind_rad + LAG_RAD + span_rad
+        while True:
+            report = self._turn_on(goal_rad)
+            if not self._felt.is_moving:
+                x, y = np.median(report.log.wrench[-50:, :2], axis=0)
+                self._side_n = float(x), float(y)
+            felt = self._felt = felt_in(self._felt, *self._log(report, start))
+            self.moved_rad = felt.moved_rad
+            if report.tripped == "slip" or felt.has_slipped:
+                raise SkillFailure(Outcome.SLIPPED, f"the fingers slipped at {felt.peak_nm:.1f} N m")
+            if report.tripped is not None:
+                outcome = Outcome.STIFF if felt.moved_rad < MOVED_RAD else Outcome.STALLED
+                force_n = float(np.linalg.norm(report.wrench[:3]))
+                raise SkillFailure(outcome, f"it did not give way at {felt.peak_nm:.1f} N m and {force_n:.0f} N")
+            left_rad = span_rad - felt.moved_rad
+            if left_rad < SHORTEST_RAD:
+                return
+            if felt.end_rad >= limit_rad - SHORTEST_RAD:
+                raise SkillFailure(Outcome.SLIPPED, "the hand went all the way and the wheel did not follow")
+            goal_rad = min(felt.end_rad + (left_rad if felt.is_moving else min(left_rad, NEXT_RAD)), limit_rad)
+
+    def let_go(self) -> None:
+        """Release the wheel and move back from it."""
+        if self.open_m is not None:
+            self.attempt.open_to(self.open_m, name="let go")
+        elif not self._felt.has_slipped:
+            back = self._felt.end_rad - self.moved_rad - 0.7 * self.behind_rad  # until the fingers press no more
+            start = self._tool()
+            poses = arc(start, centre_m=start.translation, axis=self._axis(), angle_rad=-self.sign * back)
+            self._run(poses, "turn back", ())
+        self.attempt.leave(self.up_m)
+
+    def _axis(self) -> Array:
+        clockwise: Array = self.attempt.context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
+        return clockwise
+
+    def _tool(self) -> RigidTransform:
+        """Return the measured pose of a tool whose origin is at the hub, for which the torque is that on the wheel."""
+        return self.attempt.pose() * self._grip_from_hub
+
+    def _turn_on(self, goal_rad: float) -> MotionReport:
+        """Turn the hand on to `goal_rad`, counted from where it came down."""
+        angle = self.sign * (goal_rad - self._felt.end_rad)
+        here = self._tool()
+        poses = arc(here, centre_m=here.translation, axis=self._axis(), angle_rad=angle)
+        return self._run(poses, "turn", self._guards())
+
+    def _run(self, poses: tuple[RigidTransform, ...], name: str, guards: tuple[Guard, ...]) -> MotionReport:
+        tool = self.attempt.context.flange_from_grip * self._grip_from_hub
+        motion = through(
+            poses, name=name, speed_m_per_s=TURN_M_PER_S, flange_from_tool=tool, guards=guards,
+            compliance=self._yielding(),
+        )  # fmt: skip
+        return self.attempt.run(motion)
+
+    def _yielding(self) -> Compliance:
+        """Return how the hand yields: along the fingers, with the rim between them also radially.
+
+        Behind spokes it yields sideways as soon as the wheel moves, and keeps the side force with which that began, so
+        that the wheel guides the hand about its true hub.
+        """
+        along = 400.0
+        if self.open_m is not None:
+            stiffness, side = (50.0, INF, along), (0.0, 0.0)
+        elif self._felt.is_moving:
+            stiffness, side = (200.0, 200.0, along), self._side_n
+        else:
+            stiffness, side = (INF, INF, along), (0.0, 0.0)
+        return Compliance(
+            stiffness=(*stiffness, INF, INF, INF), damping=DAMPING, mass=MASS, max_offset_m=MAX_OFFSET_M,
+            target_wrench=(*side, 0.0, 0.0, 0.0, 0.0),
+        )  # fmt: skip
+
+    def _guards(self) -> tuple[Guard, ...]:
+        """Return what ends a turn: more torque than the felt one, the largest push, or a hold that gives way."""
+        against = (0.0, 0.0, -self.sign)  # the tool's z points into the panel, so a clockwise turn is positive about it
+        side = Guard(name="side force", quantity=Quantity.FORCE, limit=LARGEST_SIDE_N)
+        if not self._felt.is_moving or self.open_m is not None:
+            return Guard(name="effort", quantity=Quantity.TORQUE, limit=self.most_nm, axis=against), side
+        limit = min(self.most_nm, STOP_RATIO * self._felt.running_nm + STOP_NM)
+        slip_nm = SLIP_RATIO * self._felt.running_nm
+        return (
+            Guard(name="end stop", quantity=Quantity.TORQUE, limit=limit, axis=against),
+            Guard(
+                name="slip", quantity=Quantity.TORQUE, limit=slip_nm, axis=against, below=True, ticks=SLIP_TICKS
+            ),
+            side,
+        )  # fmt: skip
+
+    def _log(self, report: MotionReport, start: RigidTransform) -> tuple[Array, Array]:
+        """Return the turns of the hand (N,) since it came down, and the torques against them (N,)."""
+        context, log = self.attempt.context, report.log
+        rows = np.unique(np.linspace(0, len(log.times_s) - 1, LOG_SAMPLES).astype(int))
+        tool = context.flange_from_grip * self._grip_from_hub
+        poses = [context.kinematics.tool(q, tool) for q in log.positions_rad[rows]]
+        turned = [self.sign * float((p.rotation * start.rotation.inv()).as_rotvec() @ self._axis()) for p in poses]
+        # A turn of more than half a revolution appears with the other sign; it continues from where the last one ended.
+        near = self._felt.end_rad + np.unwrap(np.array(turned) - self._felt.end_rad)
+        near += 2.0 * np.pi * np.round((self._felt.end_rad - near[0]) / (2.0 * np.pi))
+        return near, -self.sign * log.wrench[rows, 5]

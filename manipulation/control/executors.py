@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from hal.arrays import Array
 from hal.clock import Clock, Deadline
@@ -23,6 +24,10 @@ from manipulation.plausibility.hand import wrong_width
 BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
 TURN_ARM_M = 0.1  # a turn of 1 rad counts as this much distance
 DAMPING = 1e-3  # of the damped least squares; strokes are planned clear of singularities
+DEMAND_S, MOST_DEMANDS = 0.01, 400  # the demand of a path on the joints is computed at this interval
+USABLE = 0.9  # share of the joint limits that it may ask for; compliance and the closing of the gap need the rest
+SMALL_BEND_RAD = 0.2  # between samples of an arc; more is a corner
+MOST_STRETCH = 4.0  # more only happens next to a singularity
 GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
 GRIP_REST_S = 0.05
 log = logging.getLogger(__name__)
@@ -86,15 +91,43 @@ class PathExecutor:
         self._dh = kinematics.dh
         self._tool = np.ascontiguousarray(motion.flange_from_tool.as_matrix())
         self._t = np.ascontiguousarray(motion.times_s, float)
-        self._p = np.array([pose.translation for pose in poses])
-        self._r = np.array([pose.rotation.as_matrix() for pose in poses])
-        turns = [(b.rotation * a.rotation.inv()).as_rotvec() for a, b in itertools.pairwise(poses)]
-        self._w = np.array(turns).reshape(-1, 3)
+        matrices = np.array([pose.as_matrix() for pose in poses])
+        self._p, self._r = np.ascontiguousarray(matrices[:, :3, 3]), np.ascontiguousarray(matrices[:, :3, :3])
+        turns = Rotation.from_matrix(self._r)
+        self._w = np.asarray((turns[1:] * turns[:-1].inv()).as_rotvec()).reshape(-1, 3)
         self._ways, self._speeds = smooth_ways(self._t, self._p, self._w)
+        self._rates = leg_velocities(self._t, self._p, self._ways, self._speeds)
+        self._slow_down(kinematics, start_rad)
         first = np.ascontiguousarray(poses[0].as_matrix())
         measured, _ = arm_kernels.tool_and_jacobian(self._dh, start_rad, self._tool)
         self._gap = arm_kernels.pose_error(measured, first)
         self._admittance = None if motion.compliance is None else Admittance(motion.compliance)
+
+    def _slow_down(self, kinematics: Kinematics, start_rad: Array) -> None:
+        """Stretch the times of a path that asks a joint for more speed or acceleration than it has.
+
+        A set-point that trails behind the path is where nobody has planned it.
+        """
+        step_s = max(DEMAND_S, float(self._t[-1]) / MOST_DEMANDS)
+        demand: Array = kernels.path_demand(
+            self._dh,
+            self._tool,
+            self._t,
+            self._ways,
+            self._speeds,
+            self._p,
+            self._rates,
+            self._r,
+            self._w,
+            start_rad,
+            DAMPING,
+            step_s,
+        )
+        faster = np.max(demand[0] / kinematics.velocity_rad_per_s)
+        harder = np.sqrt(np.max(demand[1] / kinematics.acceleration_rad_per_s2))
+        stretch = float(np.clip(max(faster, harder) / USABLE, 1.0, MOST_STRETCH))
+        self._t = stretch * self._t
+        self._speeds, self._rates = self._speeds / stretch, self._rates / stretch
 
     def wanted(self, tick: Tick) -> Array:
         """Return the joints whose tool pose is the path's, displaced by the admittance."""
@@ -107,6 +140,7 @@ class PathExecutor:
             self._ways,
             self._speeds,
             self._p,
+            self._rates,
             self._r,
             self._w,
             tick.elapsed_s,
@@ -125,17 +159,35 @@ class PathExecutor:
 def smooth_ways(times_s: Array, points: Array, turns: Array) -> tuple[Array, Array]:
     """Return the distance (N,) along a path of points (N, 3) and turns (N - 1, 3), and the speed (N,) at each point.
 
-    The path begins and ends at rest. At inner points the speed is the harmonic mean of the neighbouring speeds, which
-    keeps the cubic from running backwards.
+    The path begins and ends at rest. At inner points the speed is that of a spline, so that the acceleration has no step,
+    but at most three times the lower of the neighbouring speeds, so that the cubic does not run backwards.
 
-    Source: Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5(2), 1984.
+    Source: Fritsch and Carlson, SIAM J. Numer. Anal. 17(2), 1980.
     """
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1) + TURN_ARM_M * np.linalg.norm(turns, axis=1)
     rates = lengths / np.diff(times_s)
-    speeds = np.zeros(len(times_s))
-    before, after = rates[:-1], rates[1:]
-    speeds[1:-1] = 2.0 * before * after / np.maximum(before + after, 1e-12)
-    return np.concatenate([[0.0], np.cumsum(lengths)]), speeds
+    ways = np.concatenate([[0.0], np.cumsum(lengths)])
+    speeds: Array = CubicSpline(times_s, ways, bc_type="clamped")(times_s, 1)
+    speeds[1:-1] = np.clip(speeds[1:-1], 0.0, 3.0 * np.minimum(rates[:-1], rates[1:]))
+    speeds[0] = speeds[-1] = 0.0
+    return ways, speeds
+
+
+def leg_velocities(times_s: Array, points: Array, ways: Array, speeds: Array) -> Array:
+    """Return the velocities (2, N - 1, 3) at the begin and the end of each leg between points (N, 3).
+
+    Where the path bends by little they are those of a spline, because each bend is a step of the velocity otherwise.
+    Legs that meet at a corner keep their directions, at the speeds (N,) along the ways (N,).
+    """
+    legs = np.diff(points, axis=0)
+    per_way = legs / np.maximum(np.diff(ways), 1e-12)[:, None]
+    rates = np.array([per_way * speeds[:-1, None], per_way * speeds[1:, None]])
+    along = legs / np.maximum(np.linalg.norm(legs, axis=1, keepdims=True), 1e-12)
+    cosines = np.einsum("ij,ij->i", along[:-1], along[1:])
+    bends = np.flatnonzero(cosines > np.cos(SMALL_BEND_RAD))
+    smooth = CubicSpline(times_s, points, bc_type="clamped")(times_s, 1)
+    rates[1, bends], rates[0, bends + 1] = smooth[bends + 1], smooth[bends + 1]
+    return rates
 
 
 class Admittance:

@@ -15,14 +15,14 @@ from manipulation.arm.kernels import follow_pose, frames, rotation_exp
 
 @inlined
 def pose_on_path(
-    times_s: Array, ways: Array, speeds: Array, points: Array, rotations: Array, turns: Array, t_s: float
+    times_s: Array, ways: Array, speeds: Array, points: Array, rates: Array, rotations: Array, turns: Array, t_s: float
 ) -> Array:
     """Return the pose (4, 4) at `t_s` on a path of points (N, 3), rotations (N, 3, 3) and turns (N - 1, 3).
 
-    Between neighbours the path is straight with a constant turn w, R(f) = Exp(f w) R_i, as in
-    `hal.geometry.interpolate`. The distance along the path (ways (N,), speeds (N,)) is a cubic Hermite polynomial in
-    time. It makes the speed continuous, because a constant speed between samples 20 ms apart causes 6 N of tool inertia
-    at every start.
+    Between neighbours the tool turns about one axis w, R(f) = Exp(f w) R_i, as in `hal.geometry.interpolate`. The
+    distance along the path (ways (N,), speeds (N,)) is a cubic Hermite polynomial in time, and so is the point, with the
+    velocities `rates` (2, N - 1, 3) at the begin and the end of each leg. A constant speed between samples 20 ms apart
+    causes 6 N of tool inertia at every start.
     """
     out = np.eye(4)
     last = times_s.shape[0] - 1
@@ -35,12 +35,13 @@ def pose_on_path(
     u = min(max((t_s - times_s[i]) / h, 0.0), 1.0)
     length = ways[i + 1] - ways[i]
     f = u
+    rise, begin, end = u * u * (3.0 - 2.0 * u), u * (1.0 - u) ** 2 * h, u * u * (u - 1.0) * h
     if length > 0.0:
-        rise = u * u * (3.0 - 2.0 * u)
-        f = rise + (u * (1.0 - u) ** 2 * speeds[i] + u * u * (u - 1.0) * speeds[i + 1]) * h / length
+        f = rise + (begin * speeds[i] + end * speeds[i + 1]) / length
     put2(out, rotation_exp(f * turns[i]) @ rotations[i])
     for k in range(3):
-        out[k, 3] = points[i, k] + f * (points[i + 1, k] - points[i, k])
+        way = rise * (points[i + 1, k] - points[i, k])
+        out[k, 3] = points[i, k] + way + begin * rates[0, i, k] + end * rates[1, i, k]
     return out
 
 
@@ -52,6 +53,7 @@ def path_joints(
     ways: Array,
     speeds: Array,
     points: Array,
+    rates: Array,
     rotations: Array,
     turns: Array,
     t_s: float,
@@ -64,13 +66,48 @@ def path_joints(
 
     `shift` (6,) is in base axes, `offset` (6,) in tool axes; translation first, then rotation vector.
     """
-    pose = pose_on_path(times_s, ways, speeds, points, rotations, turns, t_s)
+    pose = pose_on_path(times_s, ways, speeds, points, rates, rotations, turns, t_s)
     rotation = rotation_exp(shift[3:]) @ np.ascontiguousarray(pose[:3, :3])
     moved = rotation @ offset[:3]
     for k in range(3):
         pose[k, 3] += shift[k] + moved[k]
     put2(pose, rotation @ rotation_exp(offset[3:]))
     return follow_pose(dh, flange_from_tool, q, pose, damping, 2)
+
+
+@compiled
+def path_demand(
+    dh: Array,
+    flange_from_tool: Array,
+    times_s: Array,
+    ways: Array,
+    speeds: Array,
+    points: Array,
+    rates: Array,
+    rotations: Array,
+    turns: Array,
+    q: Array,
+    damping: float,
+    step_s: float,
+) -> Array:
+    """Return the largest speed and acceleration (2, n) of the joints along a path, by differences over `step_s`."""
+    n = dh.shape[0]
+    out = np.zeros((2, n))
+    here = follow_pose(
+        dh, flange_from_tool, q, pose_on_path(times_s, ways, speeds, points, rates, rotations, turns, 0.0), damping, 3
+    )
+    velocity = np.zeros(n)
+    count = int(np.ceil(times_s[times_s.shape[0] - 1] / step_s))
+    for k in range(1, count + 1):
+        pose = pose_on_path(times_s, ways, speeds, points, rates, rotations, turns, k * step_s)
+        there = follow_pose(dh, flange_from_tool, here, pose, damping, 2)
+        for i in range(n):
+            v = (there[i] - here[i]) / step_s
+            out[0, i] = max(out[0, i], abs(v))
+            out[1, i] = max(out[1, i], abs(v - velocity[i]) / step_s)
+            velocity[i] = v
+        here = there
+    return out
 
 
 @compiled
@@ -187,7 +224,23 @@ def warm(dh: Array) -> None:
     times, points, rotations = np.array([0.0, 1.0]), np.zeros((2, 3)), np.array([np.eye(3), np.eye(3)])
     frames(dh, q)
     path_joints(
-        dh, eye, times, times, np.zeros(2), points, rotations, np.zeros((1, 3)), 0.5, np.zeros(6), np.zeros(6), q, 1.0
+        dh,
+        eye,
+        times,
+        times,
+        np.zeros(2),
+        points,
+        np.zeros((2, 1, 3)),
+        rotations,
+        np.zeros((1, 3)),
+        0.5,
+        np.zeros(6),
+        np.zeros(6),
+        q,
+        1.0,
+    )
+    path_demand(
+        dh, eye, times, times, np.zeros(2), points, np.zeros((2, 1, 3)), rotations, np.zeros((1, 3)), q, 1.0, 0.5
     )
     hermite(times, np.zeros((2, n)), np.zeros((2, n)), 0.5)
     admittance_step(np.zeros((2, 6)), np.zeros(6), np.ones(6), np.ones(6), np.ones(6), np.ones(6), 0.01)

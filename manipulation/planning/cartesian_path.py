@@ -1,7 +1,8 @@
 """Cartesian paths: lines, arcs and sequences of poses, each from rest to rest with ramped speed.
 
 A step of the speed causes more than 8 N of tool inertia at 60 mm/s, which looks like contact. Therefore every path
-begins and ends with a ramp.
+begins and ends with a ramp, and the acceleration of a ramp rises and falls within a short time. The executor slows a path
+that asks for more than the joints may do.
 """
 
 from __future__ import annotations
@@ -11,15 +12,19 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.spatial.transform import RigidTransform, Rotation, RotationSpline
 
 from hal.arrays import Array
 from hal.geometry import difference, interpolate
 from hal.motion import CartesianPath, Compliance, Guard
+from manipulation.planning import timing_kernels
 
-RAMP_M_PER_S2 = 0.5  # a 0.9 kg tool pushes 0.5 N at this acceleration, far below any contact threshold
+RAMP_M_PER_S2 = 0.6  # a 0.9 kg tool pushes 0.5 N at this acceleration, far below any contact threshold
+RISE_S = 0.04  # in which the acceleration rises to that
 TURN_ARM_M = 0.10  # a turn of 1 rad counts as this much distance when a path is timed
-SAMPLE_S = 0.02
+SAMPLE_S, FINE_S = 0.01, 0.002
+LEAST_SPLINE = 4  # poses; fewer are joined by straight lines
 
 
 def line(
@@ -35,8 +40,15 @@ def line(
 ) -> CartesianPath:
     """Return a straight move with constant turn between two tool poses in the base frame."""
     way = _way(start, end)
+    moved = difference(end, start)
+
+    def pose_at(s: Array) -> RigidTransform:
+        share = (s / way if way > 0 else np.ones_like(s))[:, None]
+        turns = Rotation.from_rotvec(share * moved[3:])
+        return RigidTransform.from_components(start.translation + share * moved[:3], turns * start.rotation)
+
     return along(
-        lambda s: interpolate(start, end, s / way if way > 0 else 1.0),
+        pose_at,
         way,
         name=name,
         speed_m_per_s=speed_m_per_s,
@@ -58,13 +70,22 @@ def through(
     slow_last_m: float = 0.0,
     slow_ratio: float = 0.3,
 ) -> CartesianPath:
-    """Return a path through closely spaced poses; over the last `slow_last_m` the speed is `slow_ratio` of the rest."""
-    marks = np.concatenate([[0.0], np.cumsum([_way(a, b) for a, b in itertools.pairwise(poses)])])
+    """Return a path through closely spaced poses; over the last `slow_last_m` the speed is `slow_ratio` of the rest.
 
-    def pose_at(s: float) -> RigidTransform:
-        k = int(np.clip(np.searchsorted(marks, s, side="right") - 1, 0, len(poses) - 2))
-        span = marks[k + 1] - marks[k]
-        return interpolate(poses[k], poses[k + 1], (s - marks[k]) / span if span > 0 else 1.0)
+    Splines join them, because a change of direction at a pose is a step of the velocity.
+    """
+    ways = [_way(a, b) for a, b in itertools.pairwise(poses)]
+    kept = [poses[0], *(pose for pose, way in zip(poses[1:], ways, strict=True) if way > 0.0)]
+    marks = np.concatenate([[0.0], np.cumsum([way for way in ways if way > 0.0])])
+    if len(kept) < LEAST_SPLINE:
+        kept, marks = _with_poses_between(kept, marks)
+    if len(kept) < LEAST_SPLINE:  # nothing moves
+        kept, marks = [poses[0]] * LEAST_SPLINE, 1e-9 * np.arange(float(LEAST_SPLINE))
+    places = CubicSpline(marks, [pose.translation for pose in kept])
+    turns = RotationSpline(marks, Rotation.concatenate([pose.rotation for pose in kept]))
+
+    def pose_at(s: Array) -> RigidTransform:
+        return RigidTransform.from_components(places(s), turns(s))
 
     return along(
         pose_at,
@@ -80,7 +101,7 @@ def through(
 
 
 def along(
-    pose_at: Callable[[float], RigidTransform],
+    pose_at: Callable[[Array], RigidTransform],
     way_m: float,
     *,
     name: str,
@@ -92,7 +113,7 @@ def along(
     slow_last_m: float = 0.0,
     slow_ratio: float = 0.3,
 ) -> CartesianPath:
-    """Sample `pose_at(s)`, s from 0 to `way_m`, in time with a trapezoidal speed profile."""
+    """Sample `pose_at(s)`, for s (N,) from 0 to `way_m`, in time with a ramped speed."""
     times, places = ramped(
         way_m, speed_m_per_s, ramp_m_per_s2=ramp_m_per_s2, slow_last_m=slow_last_m, slow_ratio=slow_ratio
     )
@@ -100,7 +121,7 @@ def along(
         name=name,
         flange_from_tool=flange_from_tool,
         times_s=times,
-        base_from_tool=tuple(pose_at(float(s)) for s in places),
+        base_from_tool=tuple(pose_at(places)),
         guards=guards,
         compliance=compliance,
     )
@@ -116,7 +137,8 @@ def ramped(
 ) -> tuple[Array, Array]:
     """Return times (N,) s and distances (N,) m of a move from rest to rest: ramp, cruise, an optional slow end, ramp.
 
-    v(s) = min(v_max, sqrt(2 a s), sqrt(2 a (way - s))), and near the slow part sqrt(v_slow^2 + 2 a (s_slow - s)).
+    v(s) = min(v_max, sqrt(2 a s), sqrt(2 a (way - s))), and near the slow part sqrt(v_slow^2 + 2 a (s_slow - s)). The
+    distances are means over `RISE_S`, which turn the steps of the acceleration into ramps.
     """
     if way_m <= 0.0:
         return np.array([0.0, SAMPLE_S]), np.array([0.0, 0.0])
@@ -127,9 +149,13 @@ def ramped(
         v = np.minimum(v, np.sqrt((slow_ratio * speed_m_per_s) ** 2 + 2.0 * ramp_m_per_s2 * to_slow))
     # Between samples the speed changes evenly with time: dt = 2 ds / (v0 + v1).
     t = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(s) / np.maximum(v[1:] + v[:-1], 1e-9))])
-    count = max(3, int(np.ceil(t[-1] / SAMPLE_S)) + 1)
-    times = np.linspace(0.0, t[-1], count)
-    return times, np.interp(times, t, s)
+    way = CubicHermiteSpline(t, s, v)
+    fine = np.arange(0.0, t[-1] + FINE_S, FINE_S)
+    smooth: Array = timing_kernels.smoothed(way(np.minimum(fine, t[-1])), round(RISE_S / FINE_S))
+    duration_s = FINE_S * (len(smooth) - 1)
+    times = np.linspace(0.0, duration_s, max(3, int(np.ceil(duration_s / SAMPLE_S)) + 1))
+    places = np.interp(times, FINE_S * np.arange(len(smooth)), smooth)
+    return times, np.maximum.accumulate(np.clip(places, 0.0, way_m))
 
 
 def arc(
@@ -151,6 +177,16 @@ def turned_about(pose: RigidTransform, centre_m: Array, unit_axis: Array, angle_
 def shifted(pose: RigidTransform, offset_m: ArrayLike) -> RigidTransform:
     """Return the pose moved by an offset given in its own axes."""
     return pose * RigidTransform.from_translation(np.asarray(offset_m, float))
+
+
+def _with_poses_between(poses: list[RigidTransform], marks: Array) -> tuple[list[RigidTransform], Array]:
+    """Return the poses and marks with two more on each leg."""
+    out, at = poses[:1], [float(marks[0])]
+    for (a, b), (low, high) in zip(itertools.pairwise(poses), itertools.pairwise(marks), strict=True):
+        for share in (1.0 / 3.0, 2.0 / 3.0, 1.0):
+            out.append(interpolate(a, b, share))
+            at.append(float(low + share * (high - low)))
+    return out, np.array(at)
 
 
 def _way(start: RigidTransform, end: RigidTransform) -> float:

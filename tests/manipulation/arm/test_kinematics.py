@@ -145,7 +145,8 @@ def test_a_path_is_interpolated_as_the_house_interpolates(a: np.ndarray, b: np.n
     turn = (end.rotation * start.rotation.inv()).as_rotvec()
     points, rotations = np.array([a, b]), np.array([start.rotation.as_matrix(), end.rotation.as_matrix()])
     times, ways = np.array([1.0, 3.0]), np.array([0.0, 1.0])
-    pose = control_kernels.pose_on_path(times, ways, np.array([0.5, 0.5]), points, rotations, turn[None], 1.0 + 2.0 * f)
+    rates, speeds = np.array([[(b - a) / 2.0]] * 2), np.array([0.5, 0.5])
+    pose = control_kernels.pose_on_path(times, ways, speeds, points, rates, rotations, turn[None], 1.0 + 2.0 * f)
     assert np.abs(pose - interpolate(start, end, f).as_matrix()).max() < 1e-9
 
 

@@ -6,8 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 from hal.clock import SimClock
+from hal.devices import ArmCapabilities
 from hal.geometry import difference, perturbed
 from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTrajectory
 from manipulation.arm.kinematics import Kinematics
@@ -22,7 +25,8 @@ from manipulation.control.executors import (
 )
 from manipulation.control.recorder import Recorder
 from manipulation.control.sensing import Sample, command_wait_s
-from tests.manipulation.arms import T3
+from manipulation.planning.cartesian_path import arc, line, through
+from tests.manipulation.arms import SEVEN, T3, UR
 from tests.manipulation.rig import GRIP, HOME, tool_pose
 
 ARM = Kinematics.of(T3)
@@ -105,11 +109,38 @@ def test_a_path_starts_at_the_measured_tool_and_has_closed_the_gap_after_a_quart
 def test_a_path_that_shifts_and_turns_is_at_each_of_its_poses_in_time() -> None:
     start = tool_pose(HOME)
     poses = tuple(perturbed(start, np.array([0, 0, 0.02 * k, 0.2 * k, 0, 0])) for k in range(4))
-    times = np.array([0.0, 0.3, 0.6, 0.9])
+    times = np.array([0.0, 0.6, 1.2, 1.8])
     motion = CartesianPath(name="path", flange_from_tool=GRIP, times_s=times, base_from_tool=poses)
-    joints = followed(PathExecutor(motion, ARM, HOME), 0.9, HOME)
+    joints = followed(PathExecutor(motion, ARM, HOME), 1.8, HOME)
     for at_s, pose in zip(times, poses, strict=True):
         np.testing.assert_allclose(difference(tool_pose(joints[round(at_s / DT_S)]), pose), 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("caps", [T3, UR, SEVEN], ids=lambda caps: caps.model)
+@given(seed=st.integers(0, 10**6), speed=st.sampled_from([0.06, 0.15, 0.25]), is_arc=st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_every_tick_of_any_stroke_keeps_the_limits_of_the_joints(
+    caps: ArmCapabilities, seed: int, speed: float, is_arc: bool
+) -> None:
+    arm, rng = Kinematics.of(caps), np.random.default_rng(seed)
+    start_rad = rng.uniform(-1.5, 1.5, len(arm.dh))
+    start = arm.tool(start_rad, GRIP)
+    if is_arc:
+        centre = start.translation + rng.normal(0.0, 0.08, 3)
+        poses = arc(start, centre_m=centre, axis=rng.normal(0.0, 1.0, 3), angle_rad=rng.uniform(0.2, 1.7))
+        motion = through(poses, name="arc", speed_m_per_s=speed, flange_from_tool=GRIP)
+    else:
+        end = perturbed(start, rng.normal(0.0, 0.05, 6))
+        motion = line(start, end, name="line", speed_m_per_s=speed, flange_from_tool=GRIP)
+    run = PathExecutor(motion, arm, start_rad)
+    joints = [start_rad] * 3
+    while not run.is_over(tick(DT_S * (len(joints) - 4))):
+        joints.append(run.wanted(tick(DT_S * (len(joints) - 3), last_rad=joints[-1])))
+    assume(min(arm.conditioning(q) for q in joints[::20]) > 0.1)  # next to singularities strokes are refused
+    sent = np.array([*joints, *[joints[-1]] * 3])
+    assert (np.abs(np.diff(sent, axis=0)) / DT_S <= arm.velocity_rad_per_s).all()
+    assert (np.abs(np.diff(sent, 2, axis=0)) / DT_S**2 <= arm.acceleration_rad_per_s2).all()
+    assert (np.abs(np.diff(sent, 3, axis=0)) / DT_S**3 <= 1.2 * arm.jerk_rad_per_s3).all()
 
 
 def test_a_compliant_path_yields_by_force_over_stiffness_along_the_tools_own_axis() -> None:

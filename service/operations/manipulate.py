@@ -76,6 +76,23 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     )
 
 
+def refused_action(panel_object: PanelObject, body: ActionBody, refusal: CellError) -> ActionResult:
+    """Return the account of an action that was not begun; its outcome is the type of the error."""
+    return ActionResult(
+        object=panel_object.name,
+        skill=panel_object.kind,
+        target=text_of(panel_object, target_of(panel_object, body)),
+        outcome=refusal.type_name,
+        detail=f"{refusal.what}; {refusal.hint}",
+        before="not read",
+        after="not read",
+        confirmed=False,
+        attempts=0,
+        peak_force_n=0.0,
+        cell_s=0.0,
+    )
+
+
 def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
     """Return the target of an action; the usual target of the kind when the request names none.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from fusion import Observation, PoseTolerance
 from hal.devices import DeviceKind
-from hal.errors import CellError, DeviceError, InvalidRequest
+from hal.errors import CellError, DeviceError, InvalidRequest, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject, Shown
 from perception.vision import ObjectReading, PanelWay
@@ -31,7 +31,7 @@ from service.operations.locate import (
     rims_in,
     scan_plate,
 )
-from service.operations.manipulate import work
+from service.operations.manipulate import refused_action, work
 from service.operations.range_detection import (
     OVERVIEW,
     SurfaceView,
@@ -204,8 +204,17 @@ def _work_all(session: Session, record: MissionRecord, request: MissionRequest, 
     for k, body in enumerate(actions):
         with _step(session, f"work {body.object}", 0.58 + k * width, 0.58 + (k + 1) * width) as part:
             part.progress(0.0, f"work {body.object}")
-            need_its_place(checks, body.object)
-            deed = work(part, body)
+            try:
+                need_its_place(checks, body.object)
+                deed = work(part, body)
+            except (
+                InvalidRequest,
+                PerceptionError,
+                Unreachable,
+            ) as refusal:  # the other controls can still be operated
+                part.progress(1.0, f"{body.object} is not operated", refusal.what)
+                record.actions.append(refused_action(part.panel.object(body.object), body, refusal))
+                continue
             record.actions.append(deed.action)
             if deed.after is not None:
                 record.readings.append(reading_result(deed.after, AFTER))

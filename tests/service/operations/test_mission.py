@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hal.config import load_cell
-from hal.errors import CellError, DeviceFault, NotFound
+from hal.errors import CellError, DeviceFault, InvalidRequest, NotFound
 from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
 from service.evaluate import evaluate
@@ -127,6 +127,25 @@ def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path)
     assert depths["bypass"]["views"] >= 3 and depths["bypass"]["sigma_m"] < 0.0015
     pictures = [path.name for path in (tmp_path / "honest/runs").glob("*/*.png")]
     assert {"lights.png", "range.png", "surfaces.png", "pose.png", "wrench.png", "joints.png"} <= set(pictures)
+
+
+def test_a_control_that_cannot_be_operated_keeps_the_mission_from_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_session: Session, body: ActionBody) -> None:
+        raise InvalidRequest(f"the angle of {body.object} is not known", hint="read it first")
+
+    monkeypatch.setattr("service.operations.mission.work", refuse)
+    asked = (ActionBody(object="bypass", angle_rad=1.0), ActionBody(object="setpoint", value=65.0))
+    with mission_context(tmp_path, seed=3) as context:
+        answer = run_mission(context, MissionRequest(actions=asked))
+    assert [(one.object, one.outcome, one.confirmed) for one in answer.actions] == [
+        ("bypass", "invalid-request", False),
+        ("setpoint", "invalid-request", False),
+    ]
+    assert answer.actions[0].detail == "the angle of bypass is not known; read it first"
+    assert not answer.succeeded
+    assert report_of(tmp_path)["steps"][-1]["name"] == "retreat", "the mission goes on to its end"
 
 
 def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_worked(tmp_path: Path) -> None:

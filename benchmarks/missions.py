@@ -1,4 +1,4 @@
-"""Runs and judges whole missions: `python -m benchmarks.missions [FIRST LAST] [--cell FILE] [--panel FILE]`.
+"""Runs and judges whole missions: `python -m benchmarks.missions [FIRST LAST] [--cell FILE] [--panel FILE] [--scanner WAY]`.
 
 Every mission runs through the real server, as by `panelwright demo --seed N --judge`. Prints a table of missions, one of
 kinds (readings and actions that were right, wrong, refused or not confirmed) and the pass lines.
@@ -20,6 +20,7 @@ import numpy as np
 import tomlkit
 
 from benchmarks.cell import clear_stop, run_to_end
+from benchmarks.swept_scanner import SCANNER, WIRES, with_scanner
 from hal.arrays import Array
 from hal.config import Cell, load_cell
 from service.client import Client
@@ -82,22 +83,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("last", type=int, nargs="?", default=20)
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
     parser.add_argument("--panel", type=Path, help="a panel file other than the cell's own")
+    parser.add_argument(
+        "--scanner",
+        choices=("polar", *WIRES),
+        help="a line scanner, simulated or by its driver over an emulated wire, in place of the range camera",
+    )
     given = parser.parse_args(arguments)
     if given.last < given.first:
         parser.error(f"the seeds {given.first} to {given.last} are none: FIRST comes before LAST")
     print(f"{HEAD}\n|{' --- |' * 12}", flush=True)
     runs = []
     for seed in range(given.first, given.last + 1):
-        runs.append(run(seed, given.cell, given.panel))
+        runs.append(run(seed, given.cell, given.panel, given.scanner))
         print(runs[-1].row(), flush=True)
     print(by_kind(runs))
     return summary(runs)
 
 
-def run(seed: int, cell: Path, panel: Path | None = None) -> Run:
+def run(seed: int, cell: Path, panel: Path | None = None, scanner: str | None = None) -> Run:
     """Run and judge one mission in a new service."""
     with tempfile.TemporaryDirectory() as folder:
-        loaded = load_cell(cell if panel is None else with_panel(cell, panel, Path(folder)), seed=seed)
+        is_own = panel is None and scanner is None
+        loaded = load_cell(cell if is_own else changed(cell, panel, scanner, Path(folder)), seed=seed)
         panelwright = Panelwright(loaded, Options(port=0, runs_dir=Path(folder)))
         panelwright.start()
         try:
@@ -112,16 +119,23 @@ def run(seed: int, cell: Path, panel: Path | None = None) -> Run:
         return Run(seed=seed, report=report, places_m=built_places(loaded, seed))
 
 
-def with_panel(cell: Path, panel: Path, folder: Path) -> Path:
-    """Write a cell file that has another panel, into `folder`, and return its path."""
+def changed(cell: Path, panel: Path | None, scanner: str | None, folder: Path) -> Path:
+    """Write a cell file that has another panel or line scanner, into `folder`, and return its path."""
     loaded = load_cell(cell)
     table = tomllib.loads(cell.read_text(encoding="utf-8"))
     table["cell"] |= {
-        "panel": str(panel.resolve()),
+        "panel": str((panel or loaded.panel_path).resolve()),
         "calibrations": str(loaded.calibration_path("any").parent.resolve()),
     }
     if loaded.knowledge_path is not None:
         table["cell"]["knowledge"] = str(loaded.knowledge_path.resolve())
+    if scanner is not None:
+        file = with_scanner(loaded, scanner).file
+        table["cell"]["mode"] = file.cell.mode
+        table["devices"][SCANNER] |= file.devices[SCANNER].model_dump(include={"driver", "options"})
+        if scanner in WIRES:
+            emulator = file.emulators[SCANNER].model_dump(exclude_none=True)
+            table["emulators"] = table.get("emulators", {}) | {SCANNER: emulator}
     path = folder / "cell.toml"
     path.write_text(tomlkit.dumps(table), encoding="utf-8")
     return path

@@ -62,9 +62,8 @@ class Seen:
     matched: frozenset[str]
 
 
-def cell_with(name: str, way: str, seed: int) -> Cell:
-    """Return a shipped cell whose range scanner is of another kind."""
-    cell = load_cell(ROOT / f"cells/{name}.toml", seed=seed)
+def with_scanner(cell: Cell, way: str) -> Cell:
+    """Return a simulated cell whose range scanner is of another kind: `polar`, or one of `WIRES`."""
     file = cell.file
     section = file.devices[SCANNER]
     emulators, mode = dict(file.emulators), file.cell.mode
@@ -120,7 +119,9 @@ def seen_from_the_overview(session: Session) -> Seen:
 
 def measure(name: str, way: str, seed: int) -> Seen:
     """Return what one scanner sees in one world."""
-    with tempfile.TemporaryDirectory() as folder, session_of(cell_with(name, way, seed), Path(folder)) as session:
+    cell = with_scanner(load_cell(ROOT / f"cells/{name}.toml", seed=seed), way)
+    cell = with_scanner(load_cell(ROOT / f"cells/{name}.toml", seed=seed), way)
+    with tempfile.TemporaryDirectory() as folder, session_of(cell, Path(folder)) as session:
         return seen_from_the_overview(session)
 
 

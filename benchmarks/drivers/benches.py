@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from benchmarks.drivers.bench import WITHOUT_CRC, Bench
+from benchmarks.drivers.camera_benches import CAMERA_BENCHES
 from benchmarks.drivers.ros2_benches import ROS2_BENCHES
 from benchmarks.drivers.truths import (
     MovingArm,
@@ -192,6 +193,7 @@ BENCHES = (
         stamps="taken",
     ),
     *ROS2_BENCHES,
+    *CAMERA_BENCHES,
     Bench(
         name="cia402",
         start=cia402.start,

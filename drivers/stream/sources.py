@@ -103,6 +103,7 @@ class MjpegSource:
         self._parser = PartParser()
         self._waiting: deque[tuple[dict[str, str], bytes, float]] = deque()
         self._last = b""
+        self._ends_a_line: bool | None = None  # whether pictures end with a line break, which some senders count in
         self._stack = contextlib.ExitStack()
         limits = httpx2.Timeout(silence_s, connect=1.0)
         try:
@@ -141,8 +142,12 @@ class MjpegSource:
 
     def _picture(self, headers: dict[str, str], jpeg: bytes, arrived_s: float) -> Picture:
         is_repeated, self._last = jpeg == self._last, jpeg
+        # A picture that lacks a byte or two is filled up by the line break that follows it.
+        ended, self._ends_a_line = self._ends_a_line, jpeg.endswith((b"\r", b"\n"))
         fault, bgr = None, None
-        if not (jpeg.startswith(START) and jpeg.rstrip(b"\r\n\x00").endswith(END)):
+        if ended not in (None, self._ends_a_line):
+            fault = f"a picture of {len(jpeg)} bytes does not end as the one before"
+        elif not (jpeg.startswith(START) and jpeg.rstrip(b"\r\n\x00").endswith(END)):
             fault = f"a picture of {len(jpeg)} bytes is cut off"
         else:
             bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)

@@ -18,7 +18,7 @@ import pytest
 
 from drivers.stream.camera import Freshness, StreamCamera, StreamCameraOptions
 from drivers.stream.onvif import stream_address
-from drivers.stream.sources import PartParser, Picture
+from drivers.stream.sources import MjpegSource, PartParser, Picture
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 from hal.conformance import CameraContract, Rig
 from hal.errors import DeviceTimeout, DeviceUnavailable
@@ -49,6 +49,7 @@ class Sender(ThreadingHTTPServer):
         self.has_stamps = has_stamps
         self.is_silent = False
         self.is_up = True
+        self.cut_every = 0  # each so manyth picture lacks a byte of those that its length counts
         self.status = 200
         self.login: str | None = None  # what Basic authentication must carry
         self.closing = threading.Event()
@@ -91,9 +92,11 @@ class Handler(BaseHTTPRequestHandler):
             number += 1
             stamp = f"X-Timestamp: {1000.0 + now_s():.6f}\r\n" if sender.has_stamps else ""
             picture = jpeg(number)
+            is_cut = sender.cut_every and number % sender.cut_every == 0
+            cut = len(picture) - 4 if is_cut else len(picture)
             head = f"--frame\r\nContent-Type: image/jpeg\r\n{stamp}Content-Length: {len(picture)}\r\n\r\n"
             try:
-                self.wfile.write(head.encode() + picture + b"\r\n")
+                self.wfile.write(head.encode() + picture[:cut] + picture[cut + 1 :] + b"\r\n")
             except OSError:
                 return
 
@@ -200,6 +203,16 @@ def test_rtsp_of_ffmpeg_is_read_with_the_stamps_of_rtp() -> None:
     camera.close()
     assert sample.device_time_s is not None and sample.quality is Quality.VALID
     assert sample.value.pixels.shape == (120, 160, 3)
+
+
+def test_a_picture_that_lacks_one_byte_is_not_filled_up_by_the_line_break_behind_it() -> None:
+    with sending() as sender:
+        sender.cut_every = 4
+        source = MjpegSource(sender.url, None, 1.0)
+        faults = [source.next().fault for _ in range(11)]
+        source.close()
+    assert faults[3] is not None and faults[7] is not None
+    assert [faults[n] for n in (0, 1, 2, 5, 6, 9, 10)] == 7 * [None]
 
 
 class Script:

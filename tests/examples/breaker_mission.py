@@ -9,7 +9,7 @@ import json
 import sys
 from pathlib import Path
 
-from benchmarks.missions import with_panel
+from benchmarks.missions import changed
 from hal.config import load_cell
 from service.evaluate import evaluate
 from service.operations.mission import run_mission
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 
 def main(folder: Path, seed: int) -> None:
     """Print the report's readings, its verdict and the kinds that were recognised."""
-    path = with_panel(ROOT / "cells/bench.toml", ROOT / "examples/kind-package/panel.toml", folder)
+    path = changed(ROOT / "cells/bench.toml", ROOT / "examples/kind-package/panel.toml", None, folder)
     cell = load_cell(path, seed=seed)
     runtime = CellRuntime.start(cell, is_latched=lambda: False)
     try:

@@ -37,7 +37,7 @@ def read(spokes: int, *, beside_m: tuple[float, float], seed: int = 1) -> PatchR
     return read_handwheel(patch_of(image, image, view, wheel, shift_px), wheel)
 
 
-@pytest.mark.parametrize("spokes", [3, 4, 5])
+@pytest.mark.parametrize("spokes", [2, 3, 4, 5])
 @pytest.mark.parametrize("towards_rad", np.linspace(0.0, 2.0 * np.pi, 6, endpoint=False))
 def test_a_wheel_one_millimetre_beside_its_place_keeps_its_angle(spokes: int, towards_rad: float) -> None:
     """A common shift of the spokes must not be read as a rotation; 0.06 rad of a small wheel make a false `done`."""
@@ -86,3 +86,28 @@ def test_a_spoke_that_differs_within_the_wheels_own_grays_is_not_surely_the_mark
     status = read_handwheel(patch, wheel)
     assert (status.confidence >= 0.8) is is_sure
     assert not is_sure or status.value == pytest.approx(ANGLE_RAD, abs=0.03)
+
+
+@pytest.mark.parametrize("spokes", [2, 3, 4])
+def test_light_from_above_on_the_marked_spoke_does_not_turn_the_wheel(spokes: int) -> None:
+    """The lower half of a bright round spoke is as grey as the plate; only its upper half is seen."""
+    px_per_m, middle, R, angle_rad = 2000.0, np.full(2, 99.5), 60.0, -1.5
+    wheel = Handwheel(name="trim", position_m=(0.0, 0.0), radius_m=0.030, rim_m=0.004, height_m=HEIGHT_M, spokes=spokes)
+    picture = np.full((200, 200), 170, np.uint8)
+
+    def line(angle: float, gray: int, wide: int, up: float = 0.0) -> None:
+        ends = [middle + [0.0, -up] + share * R * np.array([np.sin(angle), -np.cos(angle)]) for share in (0.0, 1.0)]
+        a, b = ([round(16 * float(k)) for k in end] for end in ends)
+        cv2.line(picture, a, b, gray, wide, cv2.LINE_AA, 4)
+
+    for k in range(1, spokes):
+        line(angle_rad + 2.0 * np.pi * k / spokes, 60, 11)
+    line(angle_rad, 230, 7, up=4.0)
+    cv2.circle(picture, [round(16 * float(k)) for k in middle], round(16 * R), 60, 15, cv2.LINE_AA, 4)
+    noise = np.random.default_rng(0).normal(0.0, 2.0, picture.shape)
+    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 1.3) + noise), 0, 255).astype(np.uint8)
+    patch = Patch(
+        gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=px_per_m, image_px_per_m=px_per_m / 1.5,
+        origin_px=middle, parallax_px_per_m=np.zeros(2), growth_per_m=0.0, plane_z_m=0.0,
+    )  # fmt: skip
+    assert read_handwheel(patch, wheel).value == pytest.approx(angle_rad, abs=0.015)

@@ -16,6 +16,7 @@ from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, Unsupported
 from hal.geometry import difference
 from hal.panel import Panel, PanelObject, Shown
+from hal.panel.button import PRESSED_ONCE
 from hal.simulated import ObjectTruth, Truth
 from service.jsonable import jsonable
 from service.processes.connection import CellConnection
@@ -133,7 +134,7 @@ def _action_claim(
     """Judge an action: a confirmed one must have reached its target; an unconfirmed one claims nothing."""
     name = action["object"]
     spec = panel.object(name)
-    reached = _reached(spec, action, after)
+    reached = _reached(spec, action, before, after)
     return ActionClaim(
         name=name,
         what=f"{action['skill']} to {action['target']}",
@@ -163,8 +164,15 @@ def _moved_unasked(
     ]
 
 
-def _reached(spec: PanelObject, action: dict[str, Any], after: dict[str, ObjectTruth]) -> bool:
-    """Return whether the object that shows the result of the action truly shows its target."""
+def _reached(
+    spec: PanelObject, action: dict[str, Any], before: dict[str, ObjectTruth], after: dict[str, ObjectTruth]
+) -> bool:
+    """Return whether the object that shows the result of the action truly shows its target.
+
+    A button that springs back shows nothing afterwards; its simulated switch counts the presses.
+    """
+    if action["target"] == PRESSED_ONCE:
+        return (after[spec.name].value or 0.0) > (before[spec.name].value or 0.0)
     return spec.goal is not None and spec.goal.is_reached(action["target"], shown_of(after[spec.shown_by]))
 
 

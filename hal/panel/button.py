@@ -9,6 +9,9 @@ from hal.panel.goals import StateGoal
 from hal.panel.parts import LATCHED_SHARE, Name, NotNegative, Positive
 from hal.panel.questions import COLOURS, Question, Taught
 
+PRESSED_ONCE = "pressed once"
+"""Goal of a button that springs back and works no lamp: it keeps no state that a look could confirm."""
+
 
 class Button(Round):
     """Push button; `latching` ones stay in. States `pressed` and `released`."""
@@ -35,12 +38,12 @@ class Button(Round):
 
     @property
     def goal(self) -> StateGoal:
-        """States of its lamp, or of the cap itself, which only stays in when it latches."""
+        """States of its lamp, or of the cap itself if it latches; else to be pressed once, whose proof is felt."""
         if self.lights_lamp is not None:
-            states: tuple[str, ...] = ("on", "off")
-        else:
-            states = ("pressed", "released") if self.latching else ("pressed",)
-        return StateGoal(states=states, usual=states[0])
+            return StateGoal(states=("on", "off"), usual="on")
+        if self.latching:
+            return StateGoal(states=("pressed", "released"), usual="pressed")
+        return StateGoal(states=(), usual=PRESSED_ONCE)
 
     @property
     def shown_by(self) -> str:

@@ -26,6 +26,7 @@ class StateGoal:
     """Goal that is one of several states.
 
     Attributes:
+        states: none for a control that keeps no state; it can only be given its `usual` deed.
         usual: state that is meant if the request names none; None if the request must name one.
     """
 
@@ -44,7 +45,12 @@ class StateGoal:
         hint = f"states: {', '.join(self.states)}"
         if state is None:
             raise InvalidRequest(f"{name} needs a state", hint=hint)
-        if state not in self.states:
+        if not self.states and state != self.usual:
+            raise InvalidRequest(
+                f"{name} keeps no state, so neither a look nor the fingers could confirm that it is {state!r}",
+                hint=f"leave the state out: {name} is then {self.usual}, which the fingers confirm",
+            )
+        if self.states and state not in self.states:
             raise InvalidRequest(f"{name} has no state {state!r}", hint=hint)
         return str(state)
 
@@ -58,7 +64,7 @@ class StateGoal:
 
     def other_than(self, shown: Shown) -> str:
         """Return the first state that is not shown now."""
-        return next(state for state in self.states if state != shown.state)
+        return next((state for state in self.states if state != shown.state), self.usual or "")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

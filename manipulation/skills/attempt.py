@@ -22,7 +22,7 @@ from hal.motion import (
 )
 from manipulation.planning.cartesian_path import line, shifted, through
 from manipulation.skills.context import SkillContext
-from manipulation.skills.outcome import Outcome, SkillFailure
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 
 APPROACH_M_PER_S = 0.06
 CONTACT_N = 8.0
@@ -33,16 +33,24 @@ PADS_M_PER_S = 0.1
 LET_GO_N = 15.0
 CLOSED_M = 0.0005
 GRASP_M_PER_S = 0.03
+ENDED = "the stroke ended as declared"
 FREE_N = 40.0  # a larger force in a move that should be free is a collision
 
 
 class Attempt:
-    """Runs the declared motions of one skill and keeps their reports."""
+    """Runs the declared motions of one skill and keeps their reports.
+
+    Attributes:
+        felt: the state of the object that the fingers felt after the stroke; None if the stroke proves none.
+        cause: how the stroke ended, for people.
+    """
 
     def __init__(self, context: SkillContext) -> None:
         self.context = context
         self.reports: list[MotionReport] = []
         self.is_stopped_in_transfer = False
+        self.felt: ObjectState | None = None
+        self.cause = ENDED
 
     def run(self, motion: DeclaredMotion) -> MotionReport:
         """Execute a motion; returns when it completed or one of its own guards ended it.

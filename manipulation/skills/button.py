@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+from hal.errors import InvalidRequest
 from hal.panel import Button
+from hal.panel.button import PRESSED_ONCE
 from manipulation.skills.context import SkillContext
-from manipulation.skills.outcome import ObjectState, Outcome, SkillReport, Verify
-from manipulation.skills.press import press
+from manipulation.skills.outcome import ObjectState, SkillReport, Verify
+from manipulation.skills.press import press_latching, press_once
 
 
 def button(
@@ -20,7 +20,8 @@ def button(
 ) -> SkillReport:
     """Press the button once, but not if the expected state was already seen, because a press would undo it.
 
-    A button that springs back and switches no lamp shows nothing afterwards, so its outcome is `unverified`.
+    The lamp that the button works shows the effect. A latching button without a lamp is felt: a latched cap stands lower.
+    A button that springs back and works no lamp is done when the fingers felt its travel and its return.
 
     Args:
         expected: the state that the read-back must show afterwards: `pressed` or `released` of a latching button, or
@@ -29,18 +30,22 @@ def button(
         verify: the caller's read-back.
 
     Raises:
+        InvalidRequest: a state is expected of a button that springs back and works no lamp.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    shows = push_button.latching or push_button.lights_lamp is not None
-    report = press(
+    wanted = None if expected == PRESSED_ONCE else expected
+    if push_button.lights_lamp is None and push_button.latching:
+        return press_latching(context, push_button, wanted, skill="button", releases=True)
+    if push_button.lights_lamp is None and wanted is not None:
+        raise InvalidRequest(
+            f"{push_button.name} springs back and works no lamp, so nothing could show that it is {wanted!r}",
+            hint="leave the state out: it is then pressed once, and its felt travel confirms that",
+        )
+    return press_once(
         context,
         push_button,
-        skill="button",
-        target=expected or "pressed once",
-        is_reached=lambda seen: expected is None or seen.state == expected,
-        verify=verify if shows or expected is None else None,
-        is_there=verify is not None and current is not None and current.state == expected,
+        target=wanted or PRESSED_ONCE,
+        is_reached=lambda seen: wanted is None or seen.state == wanted,
+        verify=verify if push_button.lights_lamp is not None else None,
+        is_there=wanted is not None and verify is not None and current is not None and current.state == wanted,
     )
-    if shows or report.outcome is not Outcome.UNVERIFIED:
-        return report
-    return replace(report, cause="the stroke ended as declared; it springs back and works no lamp that would show it")

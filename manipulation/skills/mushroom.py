@@ -5,7 +5,7 @@ from __future__ import annotations
 from hal.panel import Mushroom
 from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import ObjectState, SkillReport, Verify
-from manipulation.skills.press import press
+from manipulation.skills.press import press_latching
 
 
 def mushroom(
@@ -13,14 +13,12 @@ def mushroom(
     cap: Mushroom,
     target: str = "pressed",
     *,
-    current: ObjectState | None = None,  # noqa: ARG001 - not needed, because a second press leaves a latched cap latched
-    verify: Verify | None = None,
+    current: ObjectState | None = None,  # noqa: ARG001 - not needed, because the head's height is felt
+    verify: Verify | None = None,  # noqa: ARG001
 ) -> SkillReport:
-    """Press the mushroom until it latches.
+    """Press the mushroom until it is felt to be latched.
 
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    return press(
-        context, cap, skill="mushroom", target=target, is_reached=lambda seen: seen.state == target, verify=verify
-    )
+    return press_latching(context, cap, target, skill="mushroom", releases=False)

@@ -5,70 +5,92 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 
-import numpy as np
-
-from hal.motion import Guard, MotionReport, Quantity
 from hal.panel import Button, Mushroom
-from manipulation.planning.cartesian_path import shifted
-from manipulation.skills.attempt import STANDOFF_M, Attempt
-from manipulation.skills.contact import SOFT_PUSH
-from manipulation.skills.context import SkillContext, panel_from_grip
+from hal.panel.parts import LATCHED_SHARE
+from manipulation.skills import cap as feeling
+from manipulation.skills.attempt import Attempt
+from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
-from manipulation.skills.probe import TURNS_RAD
 from manipulation.skills.repeat import MAX_ATTEMPTS, perform
 
-SEEK_N = 2.5  # a light contact ends the fast part of the approach, so that the slow part begins above or on the cap
-SEEK_ABOVE_M = 0.004
-PRESS_M_PER_S = 0.020
-STOP_FLOOR_N = 15.0
-EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
-BOTTOM_N = 6.0  # beyond the spring force at full travel, where the cap is at its stop
-DEEP_ENOUGH_RATIO = 0.3  # share of the travel that counts as a press; a latched cap has no more travel than this
-LOST_M = 0.018  # largest distance of the cap behind its expected place, plus the compression of the soft push
+PUSHES = 2  # of a latching cap in one attempt: where its state cannot be felt before, the first may show that
+ENOUGH_SHARE = 0.8  # of the travel: a shorter push may have had no effect
 
 
-def press(
-    context: SkillContext,
-    cap: Button | Mushroom,
-    *,
-    skill: str,
-    target: str,
-    is_reached: Callable[[ObjectState], bool],
-    verify: Verify | None,
-    is_there: bool = False,
+def press_latching(
+    context: SkillContext, cap: Button | Mushroom, target: str | None, *, skill: str, releases: bool
 ) -> SkillReport:
-    """Press a cap down to its stop and release it.
+    """Press a cap that latches until it is felt to be in the target state.
 
-    The mechanical estimate is the travel of the cap in metres.
+    The witness is the height of the cap, felt by a light touch before the push and when the cap leaves the fingertip
+    after it: a latched cap stays deeper. A cap that is felt to have the target state is not pressed. The mechanical
+    estimate is how much deeper than before the cap stays, m.
 
     Args:
-        is_there: the target has been seen already, so the cap is pressed only if the read-back no longer shows it.
+        target: `pressed` or `released`; None for the other state than it has.
+        releases: whether a push releases a latched cap.
     """
-
     tries = itertools.count()
 
     def stroke(attempt: Attempt) -> float:
-        if is_there and next(tries) == 0:
-            return 0.0
-        x, y = cap.position_m
-        top = cap.height_m
-        heights = (top + STANDOFF_M, top + SEEK_ABOVE_M, top - cap.travel_m)
-        ways = [[panel_from_grip((x, y, z), turn) for z in heights] for turn in TURNS_RAD]
-        attempt.begin(ways, may_touch=(cap.name,), width_m=0.0, name=cap.name)
-        attempt.advance(STANDOFF_M - SEEK_ABOVE_M, name="approach", stop_n=SEEK_N)
-        report = _push(attempt, cap)
-        travel = travelled_m(report, context.hand.pad_stiffness_n_per_m)
-        if report.tripped is None:
-            raise SkillFailure(Outcome.MISSED, "no cap was met where it should be", reached=travel)
-        if travel < DEEP_ENOUGH_RATIO * cap.travel_m:
-            raise SkillFailure(Outcome.STALLED, f"it gave way by only {1e3 * travel:.1f} mm", reached=travel)
-        attempt.leave()
-        return travel
+        return _latch(attempt, cap, target, releases=releases, is_firm=next(tries) > 0)
 
     return perform(
         context,
         stroke,
         skill=skill,
+        object_name=cap.name,
+        target=target or "the other state",
+        is_reached=lambda seen: seen.state == (target or seen.state),
+        verify=None,  # the difference of two felt heights is surer than a look: of 26 looks 3 were wrong
+    )
+
+
+def press_once(
+    context: SkillContext,
+    cap: Button,
+    *,
+    target: str,
+    is_reached: Callable[[ObjectState], bool],
+    verify: Verify | None,
+    is_there: bool,
+) -> SkillReport:
+    """Press a cap that springs back, once.
+
+    The mechanical estimate is the travel of the cap in metres. The witness is the caller's look at what the button
+    works; without one, it is the felt travel, and that the cap came back.
+
+    Args:
+        is_there: the target has been seen already, so the cap is pressed only if the read-back no longer shows it.
+    """
+    tries = itertools.count()
+
+    def stroke(attempt: Attempt) -> float | None:
+        number = next(tries)
+        if is_there and number == 0:
+            attempt.cause = "nothing was moved, because it was seen there already"
+            return None
+        first = feeling.touch(attempt, cap)
+        firm = verify is None or number > (1 if is_there else 0)
+        give = feeling.push(attempt, cap, first, way_m=cap.travel_m, is_firm=firm)
+        deeper_m = feeling.let_go(attempt, first)
+        attempt.leave()
+        if cap.latching:  # its way depends on its state, and the caller's look decides
+            return give.travel_m
+        if give.travel_m < ENOUGH_SHARE * cap.travel_m:
+            what = f"it gave way by only {1e3 * give.travel_m:.1f} mm under {give.force_n:.0f} N"
+            raise SkillFailure(Outcome.STALLED, what, reached=give.travel_m)
+        if abs(deeper_m) > feeling.LATCH_MOVED * LATCHED_SHARE * cap.travel_m:
+            what = f"it did not come back: it stays {1e3 * deeper_m:.1f} mm deeper than before"
+            raise SkillFailure(Outcome.STALLED, what, reached=give.travel_m)
+        if verify is None:
+            _note(attempt, cap, target, f"it was felt to give way by {1e3 * give.travel_m:.1f} mm and to come back")
+        return give.travel_m
+
+    return perform(
+        context,
+        stroke,
+        skill="button",
         object_name=cap.name,
         target=target,
         is_reached=is_reached,
@@ -78,24 +100,35 @@ def press(
     )
 
 
-def stop_force_n(cap: Button | Mushroom) -> float:
-    """Return the force at which the cap must have reached its stop, N."""
-    full = cap.preload_n + cap.spring_n_per_m * cap.travel_m
-    return max(STOP_FLOOR_N, EFFORT_SPREAD * full + BOTTOM_N)
-
-
-def _push(attempt: Attempt, cap: Button | Mushroom) -> MotionReport:
-    guard = Guard(name="bottom", quantity=Quantity.FORCE, limit=stop_force_n(cap), axis=(0.0, 0.0, -1.0), ticks=1)
-    goal = shifted(attempt.pose(), (0.0, 0.0, SEEK_ABOVE_M + cap.travel_m + LOST_M))
-    return attempt.straight(goal, name="press", speed_m_per_s=PRESS_M_PER_S, guards=(guard,), compliance=SOFT_PUSH)
-
-
-def travelled_m(report: MotionReport, pad_stiffness_n_per_m: float) -> float:
-    """Return how far the cap moved, m: the tip's travel under force minus the compression of the pads."""
-    axis = report.base_from_tool.rotation.apply([0.0, 0.0, 1.0])
-    depth, force = report.log.tip_m @ axis, -report.log.wrench[:, 2]
-    loaded = np.flatnonzero(force > 1.0)
-    if len(loaded) == 0:
+def _latch(attempt: Attempt, cap: Button | Mushroom, target: str | None, *, releases: bool, is_firm: bool) -> float:
+    """Feel the cap and press it until it is felt to have the target state; returns how much deeper it stays, m."""
+    first = feeling.touch(attempt, cap)
+    before = feeling.state_by_touch(attempt, cap, first)
+    if target is not None and before == target:
+        _note(attempt, cap, target, f"it was felt to be {target} already and was not pressed")
+        attempt.leave()
         return 0.0
-    give = float(force.max()) / pad_stiffness_n_per_m
-    return max(0.0, float(depth.max() - depth[loaded[0]]) - give)
+    if before == "pressed" and not releases:
+        raise SkillFailure(Outcome.STALLED, "it is latched, and no push releases it")
+    for _ in range(PUSHES):
+        if not feeling.is_at(attempt, first):
+            first = feeling.touch(attempt, cap)
+        latched_m = LATCHED_SHARE * cap.travel_m
+        way_m = cap.travel_m - (latched_m if before == "pressed" else 0.0)
+        give = feeling.push(attempt, cap, first, way_m=way_m, is_firm=is_firm or before is None)
+        deeper_m = feeling.let_go(attempt, first)
+        attempt.leave()
+        if abs(deeper_m) < feeling.LATCH_MOVED * latched_m:
+            what = f"it gave way by {1e3 * give.travel_m:.1f} mm under {give.force_n:.0f} N and stays where it was"
+            raise SkillFailure(Outcome.STALLED, what, reached=deeper_m)
+        before = "pressed" if deeper_m > 0 else "released"
+        if before == (target or before):
+            side = "deeper" if deeper_m > 0 else "higher"
+            _note(attempt, cap, before, f"it was felt to stay {1e3 * abs(deeper_m):.1f} mm {side} than before")
+            return deeper_m
+    raise SkillFailure(Outcome.STALLED, f"it was pressed {PUSHES} times and is {before}")
+
+
+def _note(attempt: Attempt, cap: Button | Mushroom, state: str, cause: str) -> None:
+    attempt.felt = ObjectState(name=cap.name, state=state)
+    attempt.cause = cause

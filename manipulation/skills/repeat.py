@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from hal.errors import MotionRefused, Unreachable
-from manipulation.skills.attempt import Attempt
+from manipulation.skills.attempt import ENDED, Attempt
 from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.retreat import retreat
 
 MAX_ATTEMPTS = 3
+NO_READING, REFUSED = "; no reading was asked for afterwards", "; the reading afterwards was refused"
 
 Stroke = Callable[[Attempt], float | None]
 """One try of the stroke; returns the mechanical estimate or raises `SkillFailure`."""
@@ -30,6 +31,8 @@ def perform(
 ) -> SkillReport:
     """Try a stroke, retreat, read back, and try at most twice more while the read-back does not show the target.
 
+    A stroke that felt the target state itself (`Attempt.felt`) needs no read-back.
+
     Args:
         repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees. Not for a
             button, whose second press undoes the first.
@@ -45,18 +48,19 @@ def perform(
     for tries in range(1, attempts + 1):
         context.progress((tries - 1) / attempts, f"{skill} {object_name}: attempt {tries}")
         outcome, cause, reached = _try(attempt, stroke)
-        looks = outcome is Outcome.UNVERIFIED and verify is not None
+        looks = outcome is Outcome.UNVERIFIED and verify is not None and attempt.felt is None
         context.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {'look again' if looks else cause}")
         if outcome is Outcome.UNREACHABLE:
+            break
+        if outcome is Outcome.UNVERIFIED and attempt.felt is not None and is_reached(attempt.felt):
+            outcome, seen = Outcome.DONE, attempt.felt
             break
         seen = None if verify is None else verify()
         if seen is not None and is_reached(seen):
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
         if outcome is Outcome.UNVERIFIED and seen is None:
-            cause += (
-                "; no reading was asked for afterwards" if verify is None else "; the reading afterwards was refused"
-            )
+            cause += NO_READING if verify is None else REFUSED
             break
         if outcome is Outcome.UNVERIFIED:
             outcome, cause = Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"
@@ -76,8 +80,10 @@ def perform(
 
 
 def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:
+    attempt.felt, attempt.cause = None, ENDED
     try:
-        return Outcome.UNVERIFIED, "the stroke ended as declared", stroke(attempt)
+        reached = stroke(attempt)
+        return Outcome.UNVERIFIED, attempt.cause, reached
     except SkillFailure as failure:
         retreat(attempt.context, attempt)
         return failure.outcome, failure.cause, failure.reached

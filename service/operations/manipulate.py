@@ -55,6 +55,8 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     current = None if before is None else object_state(before, eye.witness)
     report = operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
     reached = report.is_done
+    if eye.last is None:
+        eye.forget()
     return Deed(
         action=ActionResult(
             object=panel_object.name,
@@ -63,8 +65,8 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
             outcome=str(report.outcome),
             detail="" if reached else report.cause,
             before="not read" if before is None else said(before),
-            after="not read" if eye.last is None else said(eye.last),
-            confirmed=reached and verify,
+            after=_after(report) if eye.last is None else said(eye.last),
+            confirmed=reached,
             attempts=report.attempts,
             peak_force_n=report.peak_force_n,
             cell_s=report.duration_s,
@@ -91,6 +93,12 @@ def refused_action(panel_object: PanelObject, body: ActionBody, refusal: CellErr
         peak_force_n=0.0,
         cell_s=0.0,
     )
+
+
+def _after(report: SkillReport) -> str:
+    """Return what is known of a control that was not looked at afterwards."""
+    seen = report.seen
+    return "not read" if seen is None or seen.state is None else f"{seen.state} (felt)"
 
 
 def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
@@ -179,9 +187,13 @@ class _Eye:
         """Return the skill's read-back function; None when no read-back is wanted."""
         return self._verify if self._is_open else None
 
-    def _verify(self) -> ObjectState | None:
+    def forget(self) -> None:
+        """Forget what was read before the action."""
         self._session.world.forget_reading(self.witness.name)
         self._session.world.forget_reading(self._panel_object.name)
+
+    def _verify(self) -> ObjectState | None:
+        self.forget()
         self.last = self._look()
         return None if self.last is None else object_state(self.last, self.witness)
 

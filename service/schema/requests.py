@@ -186,7 +186,7 @@ class ManipulateRequest(ActionBody):
     """Operate one control and read back whether it reached its target."""
 
     verify: Annotated[
-        bool, Field(description="read the control back afterwards; if false, the outcome is `unverified`")
+        bool, Field(description="look at the control afterwards; if false, only what the fingers feel can confirm it")
     ] = True
 
 

@@ -16,31 +16,25 @@ from hal.motion import (
     CartesianPath,
     DeclaredMotion,
     JointTrajectory,
-    MotionLog,
     MotionOutcome,
     MotionReport,
     RobotState,
 )
 from hal.panel import load_panel
 from manipulation.arm.kinematics import Kinematics
-from manipulation.planning.hand import Hand
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.attempt import Attempt
-from manipulation.skills.button import button
 from manipulation.skills.context import SkillContext
 from manipulation.skills.operate import operate
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport
-from manipulation.skills.press import stop_force_n, travelled_m
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 from manipulation.skills.probe import proximity_probe
 from manipulation.skills.retreat import PULLS, park, retreat
 from manipulation.skills.toggle import toggle
 from tests.manipulation.arms import T3
 from tests.manipulation.rig import HOME
-from tests.manipulation.skills.test_contact import AT_HOME, COMPLETED, GRIP, ScriptedMover
+from tests.manipulation.skills.test_contact import COMPLETED, GRIP, ScriptedMover
 
 PANEL = load_panel(Path(__file__).parents[3] / "panels" / "bench.toml")
-PAD_N_PER_M = Hand().pad_stiffness_n_per_m
-DOWN = AT_HOME.rotation.apply([0.0, 0.0, 1.0])
 
 
 class NamedMover(ScriptedMover):
@@ -76,73 +70,6 @@ def before_the_bench(answers: dict[str, MotionReport]) -> tuple[SkillContext, Na
     return context, mover
 
 
-def press(context: SkillContext, name: str, expected: str | None = None, **looks: Any) -> SkillReport:
-    """Press the button called `name`."""
-    return button(context, context.panel.object(name), expected, **looks)
-
-
-def pressed(free_m: float, travel_m: float, force_n: float, *, tripped: bool = True) -> MotionReport:
-    """Return the report of a push: free, then against a cap that yields by `travel_m` and elastic pads."""
-    deepest = free_m + travel_m + force_n / PAD_N_PER_M
-    depth = np.linspace(0.0, deepest, 400)
-    wrench = np.zeros((400, 6))
-    wrench[:, 2] = -force_n * np.clip((depth - free_m) / (deepest - free_m), 0.0, 1.0)
-    log = MotionLog(
-        times_s=np.arange(400) * 0.002, positions_rad=np.zeros((400, 6)), wrench=wrench,
-        tip_m=AT_HOME.translation + depth[:, None] * DOWN,
-    )  # fmt: skip
-    outcome = MotionOutcome.GUARD if tripped else MotionOutcome.COMPLETED
-    return replace(COMPLETED, outcome=outcome, tripped="bottom" if tripped else None, log=log)
-
-
-def test_the_travel_of_a_cap_is_that_of_the_tip_under_force_less_what_the_pads_gave() -> None:
-    found = travelled_m(pressed(0.004, 0.003, 20.0), PAD_N_PER_M)
-    assert found == pytest.approx(0.003, abs=4e-4)  # counted from a force of one newton
-    assert travelled_m(pressed(0.004, 0.0, 0.5), PAD_N_PER_M) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("push", "outcome"),
-    [
-        (pressed(0.004, 0.004, 20.0), Outcome.UNVERIFIED),
-        (pressed(0.004, 0.0003, 20.0), Outcome.STALLED),
-        (pressed(0.02, 0.004, 5.0, tripped=False), Outcome.MISSED),
-    ],
-    ids=["down", "stuck", "not there"],
-)
-def test_a_button_says_how_its_press_ended(push: MotionReport, outcome: Outcome) -> None:
-    context, _ = before_the_bench({"press": push})
-    told = press(context, "start", "on")
-    assert told.outcome is outcome
-    assert told.reached == pytest.approx(travelled_m(push, PAD_N_PER_M))
-
-
-def test_a_button_whose_lamp_stays_dark_is_not_pressed_again() -> None:
-    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    told = press(context, "start", "on", verify=lambda: ObjectState(name="start", state="off"))
-    assert (told.outcome, mover.asked.count("press")) == (Outcome.SLIPPED, 1)
-
-
-@pytest.mark.parametrize(
-    ("looks", "presses", "tries"), [(("on",), 0, 1), (("off", "on"), 1, 2), (("off", "off"), 1, 2)]
-)
-def test_a_button_whose_lamp_is_as_wanted_is_left_alone_unless_the_look_says_otherwise(
-    looks: tuple[str, ...], presses: int, tries: int
-) -> None:
-    """Another press would undo it: with the goal `on`, a lamp that was lit would go out."""
-    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    shown = iter(looks)
-    lit = ObjectState(name="run_lamp", state="on")
-    told = button(
-        context,
-        context.panel.object("start"),
-        expected="on",
-        current=lit,
-        verify=lambda: ObjectState(name="run_lamp", state=next(shown)),
-    )
-    assert (told.is_done, mover.asked.count("press"), told.attempts) == (looks[-1] == "on", presses, tries)
-
-
 @pytest.mark.parametrize(
     ("before", "looks", "sweeps"),
     [
@@ -168,38 +95,6 @@ def test_a_toggle_that_stands_there_already_is_looked_at_and_thrown_only_when_in
     told = toggle(context, context.panel.object("pump"), "on", current=current, verify=look)
     assert next(shown, "no more") == "no more"
     assert (told.is_done, mover.asked.count("to pump")) == (True, sweeps)
-
-
-def test_a_button_that_nothing_shows_is_pressed_and_not_confirmed() -> None:
-    panel_object = PANEL.object("start").model_copy(update={"lights_lamp": None})
-    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    context = replace(context, panel=PANEL.model_copy(update={"objects": (panel_object,)}))
-    told = button(
-        context,
-        context.panel.object("start"),
-        expected="pressed",
-        verify=lambda: ObjectState(name="start", state="released"),
-    )
-    assert (told.outcome, mover.asked.count("press")) == (Outcome.UNVERIFIED, 1)
-    assert "springs back" in told.cause
-
-
-def test_a_look_that_cannot_tell_is_not_called_no_look() -> None:
-    context, _ = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    told = press(context, "start", "on", verify=lambda: None)
-    assert (told.outcome, told.cause) == (
-        Outcome.UNVERIFIED,
-        "the stroke ended as declared; the reading afterwards was refused",
-    )
-    assert press(context, "start", "on").cause.endswith("no reading was asked for afterwards")
-
-
-def test_a_press_that_may_have_counted_is_not_repeated_when_nobody_can_tell() -> None:
-    """Otherwise a latching cap that yields little is pressed twice, which may undo the press."""
-    context, mover = before_the_bench({"press": pressed(0.004, 0.0003, 20.0)})
-    told = press(context, "hold", "pressed", verify=lambda: None)
-    assert (told.outcome, mover.asked.count("press")) == (Outcome.STALLED, 1)
-    assert "gave way by only" in told.cause and "undo" in told.cause
 
 
 @pytest.mark.parametrize(
@@ -239,14 +134,6 @@ def test_pads_open_on_the_way_and_before_it_where_the_wider_hand_has_no_room(mon
     assert widths_m == [0.03, 0.01]
 
 
-def test_a_press_is_guarded_by_more_than_the_springs_of_the_cap() -> None:
-    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    press(context, "start")
-    cap = PANEL.object("start")
-    (push,) = (m for m in mover.motions if m.name == "press")
-    assert push.guards[0].limit == stop_force_n(cap) > cap.preload_n + cap.spring_n_per_m * cap.travel_m
-
-
 @pytest.mark.parametrize(("distance_m", "against"), [(0.01, -1.0), (-0.01, 1.0)])
 def test_a_contact_is_looked_for_against_the_way(distance_m: float, against: float) -> None:
     context, mover = before_the_bench({})
@@ -262,19 +149,6 @@ def test_a_hand_that_is_held_is_pulled_again() -> None:
         with pytest.raises(MotionError, match="did not come free") if pulls == PULLS else nullcontext():
             retreat(context)
         assert mover.asked.count("retreat") == pulls
-
-
-def test_a_hand_that_is_held_when_the_stroke_has_ended_is_freed_before_anything_else() -> None:
-    held = replace(COMPLETED, outcome=MotionOutcome.GUARD, tripped="contact")
-    context, mover = before_the_bench({"press": pressed(0.004, 0.004, 20.0)})
-    answers = iter([held])  # the first retreat is held, the pulls of the freeing are not
-    execute = mover.execute
-    mover.execute = lambda motion: (  # type: ignore[method-assign]
-        next(answers, execute(motion)) if motion.name == "retreat" else execute(motion)
-    )
-    told = press(context, "start", "on", verify=lambda: ObjectState(name="start", state="on"))
-    assert told.is_done
-    assert [name for name in mover.asked if name in ("press", "let go", "retreat")][-2:] == ["let go", "retreat"]
 
 
 def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_no_defect() -> None:

@@ -61,9 +61,11 @@ def test_nonsense_is_refused_by_both_verbs_that_work_controls(body: dict[str, An
 
 def test_a_button_that_nothing_shows_can_be_asked_for_a_press_only() -> None:
     bell = CELL.panel.object("hold").model_copy(update={"latching": False})
-    assert target_of(bell, ActionBody(object="hold")) == "pressed"
-    with pytest.raises(InvalidRequest, match="no state 'released'"):
-        target_of(bell, ActionBody(object="hold", state="released"))
+    assert target_of(bell, ActionBody(object="hold")) == "pressed once"
+    for state in ("pressed", "released"):
+        with pytest.raises(InvalidRequest, match="keeps no state, so neither a look nor the fingers") as refused:
+            target_of(bell, ActionBody(object="hold", state=state))
+        assert "leave the state out" in refused.value.hint
 
 
 def test_a_mission_presses_by_itself_only_what_shows_that_it_was_pressed() -> None:

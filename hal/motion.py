@@ -6,6 +6,7 @@ tool weight subtracted) in tool axes about the tool's origin: the wrench that th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
@@ -153,6 +154,33 @@ class MotionLog:
     started_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContactForce:
+    """Impulse of the contact force over a motion, and the sums for its chatter, from all control ticks.
+
+    Attributes:
+        impulse_n_s: integral of the force over the time in contact.
+        changes: number of ticks in contact that follow a tick in contact; `squares_n2` sums the squared changes of the
+            force from tick to tick over them.
+    """
+
+    impulse_n_s: float = 0.0
+    changes: int = 0
+    squares_n2: float = 0.0
+
+    @property
+    def chatter_n(self) -> float:
+        """Root mean square of the change of the force from tick to tick in contact, N."""
+        return math.sqrt(self.squares_n2 / self.changes) if self.changes else 0.0
+
+    def __add__(self, other: ContactForce) -> ContactForce:
+        return ContactForce(
+            impulse_n_s=self.impulse_n_s + other.impulse_n_s,
+            changes=self.changes + other.changes,
+            squares_n2=self.squares_n2 + other.squares_n2,
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionReport:
     """Result of a motion; `tripped` names the guard, `device` the failed device; `cause` explains it in a sentence."""
@@ -170,6 +198,7 @@ class MotionReport:
     gripper_width_m: float | None
     log: MotionLog
     device: str | None = None
+    force: ContactForce = field(default_factory=ContactForce)
 
     @property
     def duration_s(self) -> float:

@@ -20,6 +20,7 @@ class When(Strict):
     near_m: Annotated[float, Field(gt=0.0, le=1.0, description="distance of the tips from the object that counts")] = (
         0.05
     )
+    delay_s: Annotated[float, Field(ge=0.0, le=600.0, description="how long after that it begins")] = 0.0
 
 
 class EventSection(When):

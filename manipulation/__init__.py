@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from manipulation.planning.visiting_order import visiting_order
     from manipulation.skills.context import SkillContext, is_in_reach
     from manipulation.skills.operate import operate
-    from manipulation.skills.outcome import ObjectState, SkillFailure, SkillReport, Verify
+    from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
     from manipulation.skills.retreat import free_hand, park, step_back
     from manipulation.skills.sweep import plan_sweep
@@ -30,6 +30,7 @@ __all__ = [
     "Kinematics",
     "MotionDevices",
     "ObjectState",
+    "Outcome",
     "SkillContext",
     "SkillFailure",
     "SkillReport",

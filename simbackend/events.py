@@ -40,11 +40,15 @@ def begin_when(world: Any, when: When, action: Callable[[], None]) -> None:
         world: a `WorldClient`.
     """
     if when.near is None:
-        world.at(when.at_s, action)
+        world.at(when.at_s + when.delay_s, action)
         return
+
+    def delayed() -> None:
+        world.at(world.frame.snapshot.stamp_s + when.delay_s, action)
+
     place = world.cell.panel.object(when.near).point_m
     pose = world.draws.panel_pose(world.cell.file.workspace, world.cell.file.simulation)
-    world.near.waiting.append((when.at_s, pose.apply(np.asarray(place)), when.near_m, action))
+    world.near.waiting.append((when.at_s, pose.apply(np.asarray(place)), when.near_m, delayed))
 
 
 def schedule(world: Any) -> None:

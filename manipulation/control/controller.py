@@ -264,7 +264,7 @@ class Controller:
         over_since_s: float | None = None
         while True:
             elapsed_s = sample.stamp_s - started_s
-            recorder.note(elapsed_s, sample.position_rad, look.wrench, look.base_from_tool[:3, 3])
+            recorder.note(elapsed_s, sample.position_rad, look.wrench, look.base_from_tool[:3, 3], force_n=look.force_n)
             end = watch.ending(elapsed_s, sample, look)
             try:
                 if end is None:
@@ -378,6 +378,7 @@ class Controller:
             gripper_width_m=None if sample is None else sample.gripper_width_m,
             log=recorder.log(n),
             device=end.device,
+            force=recorder.force,
         )
 
     def _state_of(self, sample: Sample) -> RobotState:

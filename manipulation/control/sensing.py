@@ -309,11 +309,15 @@ class ContactWrench:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolReading:
-    """One tick seen from a tool: measured pose (4, 4), commanded tip (3,) m, contact wrench (6,) in tool axes."""
+    """One tick seen from a tool: measured pose (4, 4), commanded tip (3,) m, contact wrench (6,) in tool axes.
+
+    `force_n` is the size of the contact force in this tick alone, not averaged with the tick before.
+    """
 
     base_from_tool: Array
     commanded_tip_m: Array
     wrench: Array
+    force_n: float = 0.0
 
 
 class ToolView:
@@ -349,4 +353,5 @@ class ToolView:
         if not sample.is_felt:
             now = np.zeros(6)
         before, self._before = self._before, now
-        return ToolReading(pose, tip, now if before is None else 0.5 * (now + before))
+        force_n = math.sqrt(float(now[:3] @ now[:3]))
+        return ToolReading(pose, tip, now if before is None else 0.5 * (now + before), force_n)

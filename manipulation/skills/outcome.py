@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from hal.motion import MotionReport
+from hal.motion import ContactForce, MotionReport
 
 
 class Outcome(StrEnum):
@@ -79,6 +79,11 @@ class SkillReport:
     def is_done(self) -> bool:
         """Whether a read-back confirmed the target."""
         return self.outcome is Outcome.DONE
+
+    @property
+    def force(self) -> ContactForce:
+        """Impulse and chatter of the contact force over all motions."""
+        return sum((motion.force for motion in self.motions), start=ContactForce())
 
     @property
     def duration_s(self) -> float:

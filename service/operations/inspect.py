@@ -17,7 +17,7 @@ from manipulation import visiting_order
 from perception.vision import ObjectReading, answer_at, draw_annotated, merge_views, said, viewpoints
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
-from service.operations.locate import go_to_overview, locate_from_overview
+from service.operations.locate import go_to_overview, locate_from_overview, offset_m
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
@@ -41,10 +41,14 @@ class AnnotatedView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inspection:
-    """The readings from one or several images, with one picture per image."""
+    """The readings from one or several images, with one picture per image.
+
+    `offset_m` is how far the last image shows the panel from its estimated pose; see `offset_m`.
+    """
 
     readings: dict[str, ObjectReading]
     pictures: tuple[AnnotatedView, ...]
+    offset_m: float = 0.0
 
 
 def inspect_here(
@@ -72,7 +76,8 @@ def inspect_here(
         raise
     session.world.note_readings(readings)
     picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings), look=view)
-    return Inspection(readings={r.name: r for r in readings}, pictures=(picture,))
+    off_m = offset_m(view, readings, session.known_panel().parent_from_child, session.panel)
+    return Inspection(readings={r.name: r for r in readings}, pictures=(picture,), offset_m=off_m)
 
 
 def inspect_close(session: Session, names: Collection[str]) -> Inspection:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hal.config import Cell
 from hal.devices import DeviceKind
@@ -12,15 +12,17 @@ from hal.errors import (
     DeviceError,
     InvalidRequest,
     MotionError,
+    NotFound,
     PerceptionError,
     Stopped,
     Unreachable,
 )
 from hal.panel import PanelObject
 from hal.panel.kinds import SKILLS, has_part
-from manipulation import ObjectState, SkillReport, Verify, free_hand, operate
+from manipulation import ObjectState, Outcome, SkillReport, Verify, free_hand, operate
 from perception.vision import ObjectReading, said
 from service.operations.inspect import ensure_located, look_close, look_past
+from service.operations.locate import OFF_PLACE_M, look_again
 from service.operations.session import Session
 from service.operations.travel import park, skill_context
 from service.report.plots import png_of
@@ -49,11 +51,14 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     """
     panel_object = session.panel.object(body.object)
     target = target_of(panel_object, body)
+    ensure_located(session)  # a panel that was not found after the deed before is looked for once more
     free_hand(skill_context(session))
     eye = _Eye(session, panel_object, verify)
-    before = eye.before()
-    current = None if before is None else object_state(before, eye.witness)
-    report = operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
+    before, findings = _look_first(session, eye, panel_object)
+    report = _operate(session, eye, panel_object, target, before)
+    if not report.is_done or eye.is_off_its_place:
+        report, found = _after_doubt(session, eye, panel_object, target, report)
+        findings += found
     reached = report.is_done
     if eye.last is None:
         eye.forget()
@@ -63,12 +68,14 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
             skill=report.skill,
             target=text_of(panel_object, target),
             outcome=str(report.outcome),
-            detail="" if reached else report.cause,
+            detail="; ".join([*findings, *([] if reached else [report.cause])]),
             before="not read" if before is None else said(before),
             after=_after(report) if eye.last is None else said(eye.last),
             confirmed=reached,
             attempts=report.attempts,
             peak_force_n=report.peak_force_n,
+            impulse_n_s=report.force.impulse_n_s,
+            chatter_n=report.force.chatter_n,
             cell_s=report.duration_s,
         ),
         report=report,
@@ -99,6 +106,64 @@ def _after(report: SkillReport) -> str:
     """Return what is known of a control that was not looked at afterwards."""
     seen = report.seen
     return "not read" if seen is None or seen.state is None else f"{seen.state} (felt)"
+
+
+def _operate(
+    session: Session, eye: _Eye, panel_object: PanelObject, target: str | float, now: ObjectReading | None
+) -> SkillReport:
+    current = None if now is None else object_state(now, eye.witness)
+    return operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
+
+
+def _look_first(session: Session, eye: _Eye, panel_object: PanelObject) -> tuple[ObjectReading | None, list[str]]:
+    """Return what the control shows before the deed, and whether the panel has moved since it was located.
+
+    Raises:
+        NotFound: the panel, or the control on it, is not where it should be.
+    """
+    before = eye.before(is_fresh=session.record is None)
+    if not eye.is_off_its_place:
+        return before, []
+    shift = look_again(session, panel_object)
+    if shift is not None:
+        before = eye.before(is_fresh=True)
+    if eye.is_missing:
+        raise NotFound(
+            f"{eye.witness.name} is not where the file of panel {session.panel.name!r} says",
+            hint="check the panel file, and that nothing hides the object",
+            objects=[eye.witness.name],
+        )
+    return before, [] if shift is None else [shift.finding]
+
+
+def _after_doubt(
+    session: Session, eye: _Eye, panel_object: PanelObject, target: str | float, report: SkillReport
+) -> tuple[SkillReport, list[str]]:
+    """Look whether the panel has moved; if so, name it, and try a deed that has not succeeded once more.
+
+    A control whose state is not known is tried again only if the hand has missed it, because a second stroke might undo
+    the first.
+    """
+    if report.outcome is Outcome.UNREACHABLE:
+        return report, []
+    try:
+        shift = look_again(session, panel_object)
+    except (PerceptionError, Unreachable) as error:
+        return report, [f"the panel was not found again afterwards: {error.what}"]
+    if shift is None or report.is_done:
+        return report, [] if shift is None else [shift.finding]
+    now = eye.before(is_fresh=True)
+    if report.outcome is not Outcome.MISSED and (now is None or report.outcome is Outcome.UNVERIFIED):
+        return report, [shift.finding]
+    again = _operate(session, eye, panel_object, target, now)
+    both = replace(
+        again,
+        attempts=report.attempts + again.attempts,
+        started_s=report.started_s,
+        peak_force_n=max(report.peak_force_n, again.peak_force_n),
+        motions=(*report.motions, *again.motions),
+    )
+    return both, [shift.finding]
 
 
 def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
@@ -175,13 +240,15 @@ class _Eye:
         self.witness = session.panel.object(panel_object.shown_by)
         self.last: ObjectReading | None = None
         self.picture: Picture | None = None
+        self.is_off_its_place = False  # the last look did not show the panel where its pose has it
+        self.is_missing = False  # the last look did not show the witness
 
-    def before(self) -> ObjectReading | None:
-        """Return what the witness showed before the action: the newest reading, or a new one."""
+    def before(self, *, is_fresh: bool) -> ObjectReading | None:
+        """Return what the witness shows before the action: the newest reading, or a new one if wanted or needed."""
         known = self._session.world.readings.get(self.witness.name)
-        if known is not None or not self._is_open:
+        if not self._is_open or (known is not None and not is_fresh):
             return known
-        return self._look()
+        return self._look() or known
 
     def verify(self) -> Verify | None:
         """Return the skill's read-back function; None when no read-back is wanted."""
@@ -198,11 +265,17 @@ class _Eye:
         return None if self.last is None else object_state(self.last, self.witness)
 
     def _look(self) -> ObjectReading | None:
+        self.is_off_its_place = self.is_missing = False
         try:
             straight = look_close(self._session, self.witness.point_m, (self.witness.name,))
+            self.is_missing = not straight.readings[self.witness.name].present
+            self.is_off_its_place = self.is_missing or straight.offset_m > OFF_PLACE_M
             found = look_past(self._session, straight)
-        except (PerceptionError, Unreachable):
+        except PerceptionError:
+            self.is_off_its_place = True
             return None  # an inconclusive read-back makes the outcome `unverified`
+        except Unreachable:
+            return None
         self.picture = Picture(
             name=f"after-{self._panel_object.name}",
             title=f"read-back of {self.witness.name}",

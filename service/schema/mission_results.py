@@ -24,7 +24,12 @@ class ReadingResult(Result):
 
 
 class ActionResult(Result):
-    """One control that was operated: the target, the report of the skill, and the readings before and after."""
+    """One control that was operated: the target, the report of the skill, and the readings before and after.
+
+    `peak_force_n` is the largest contact force over the whole deed, `impulse_n_s` its integral over the time in contact,
+    and `chatter_n` the root mean square of its change from one control tick to the next while in contact. `detail` says
+    why a deed was not done, and whether the panel has moved.
+    """
 
     object: str
     skill: str
@@ -36,6 +41,8 @@ class ActionResult(Result):
     confirmed: bool
     attempts: int
     peak_force_n: float
+    impulse_n_s: float = 0.0
+    chatter_n: float = 0.0
     cell_s: float
 
 

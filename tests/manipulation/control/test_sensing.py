@@ -12,6 +12,7 @@ from hal.clock import Clock, Deadline, PacedClock, SimClock, WallClock
 from hal.devices import JointState, Wrench
 from hal.errors import DeviceTimeout, StaleReading
 from hal.readings import Quality, Stamped
+from manipulation.control.recorder import Recorder
 from manipulation.control.sensing import (
     STALE_STEP_S,
     STALE_WAIT_S,
@@ -182,3 +183,16 @@ def test_at_rest_in_any_posture_weight_and_bias_leave_no_contact(turn: list[floa
     raw = np.concatenate([gravity, np.cross(LOAD.centre_of_mass_m, gravity)]) + np.asarray(LOAD.bias)
     found = ContactWrench(LOAD, SENSOR).in_flange(raw, np.ascontiguousarray(flange.as_matrix()))
     assert np.abs(found).max() < 1e-9
+
+
+def test_the_recorder_sums_up_the_force_of_the_ticks_in_contact_only() -> None:
+    recorder = Recorder(0.002)
+    forces_n = [0.0, 10.0, 14.0, 2.0, 20.0, 20.0]
+    for k, force_n in enumerate(forces_n):
+        recorder.note(0.002 * k, np.zeros(6), np.zeros(6), np.zeros(3), force_n=force_n)
+    assert recorder.force.impulse_n_s == pytest.approx(0.002 * (10.0 + 14.0 + 20.0 + 20.0))
+    assert recorder.force.chatter_n == pytest.approx(np.sqrt((4.0**2 + 0.0) / 2))
+    both = recorder.force + recorder.force
+    assert (both.chatter_n, both.impulse_n_s) == pytest.approx(
+        (recorder.force.chatter_n, 2 * recorder.force.impulse_n_s)
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
@@ -41,9 +43,19 @@ def parse(data: bytes, model: type[B]) -> B:
         body = model.model_validate_json(data, strict=True)
     except ValidationError as error:
         raise _refused(error, model) from None
+    json.loads(data, object_pairs_hook=_without_repeats)  # pydantic takes the last of equal keys without a word
     if not _is_finite(body.model_dump()):
         raise refuse_body(422, "a number is not finite", hint="send finite numbers")
     return body
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    counts = Counter(key for key, _ in pairs)
+    repeated = sorted(key for key, count in counts.items() if count > 1)
+    if repeated:
+        names = ", ".join(repr(key[:40]) for key in repeated[:MAX_FAULTS])
+        raise refuse_body(422, f"an object has the key {names} more than once", hint="send each key once")
+    return dict(pairs)
 
 
 def _refused(error: ValidationError, model: type[BaseModel]) -> BadBody:

@@ -83,6 +83,17 @@ def test_a_broken_body_is_refused_by_every_route(client: httpx2.Client, name: st
     _assert_problem(client.post(path, content=CORPUS[name], headers=JSON), 400, 422)
 
 
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [("/v1/echo", b'{"text": "a", "text": "b"}'), ("/v1/stop/reset", b'{"seen_count": 0, "seen_count": 10}')],
+)
+def test_a_body_with_one_key_twice_is_refused_by_its_name(client: httpx2.Client, path: str, body: bytes) -> None:
+    """JSON libraries take the first or the last of them, so that sender and receiver may mean different things."""
+    answer = client.post(path, content=body, headers=JSON)
+    _assert_problem(answer, 422)
+    assert "more than once" in answer.json()["detail"]
+
+
 def test_what_was_sent_is_never_repeated(client: httpx2.Client) -> None:
     for body in ({"text": 5, "<script>alert(1)</script>": 1}, {"number": "<script>alert(1)</script>"}):
         answer = client.post("/v1/echo", json=body)

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 RESTORED_TASKS = 100
 LOOK_S = 0.05
+COMMIT_S = 2.0  # an answer waits no longer for a slow disk
 log = logging.getLogger(__name__)
 
 
@@ -80,6 +81,7 @@ class Service:
             runs_dir=runs_dir,
             partial=partial,
             report=self.note,
+            commit=self.commit,
             record=None if self._recording is None else self._recording.endpoint,
             replay=replay,
         )
@@ -92,6 +94,7 @@ class Service:
             on_loss=self.tasks.cancel_moving,
             others=self.tasks.moving_for_others,
             report=self.note,
+            commit=self.commit,
         )
         self._is_closing = threading.Event()
         self._folder_lock = (state_dir / "lock").open("w")  # held until the process ends, even if it is killed
@@ -246,6 +249,16 @@ class Service:
             self.journal.note(kind, data)
         except CellError as error:
             log.error("not recorded: %s %s: %s", kind, data, error)
+
+    def commit(self, kind: str, data: dict[str, Any]) -> None:
+        """Write an entry to the journal and return when it is on disk, for what is acknowledged to a client.
+
+        Raises:
+            JournalError: it could not be written.
+        """
+        if self._recording is not None:
+            self._recording.note(kind, data)
+        self.journal.append(kind, data, timeout_s=COMMIT_S)
 
     def _record(self, path: Path, inline: bool) -> RecordingSession:
         from service.recording.session import RecordingSession

@@ -31,7 +31,7 @@ async def show_lease(state: State) -> LeaseView:
     "/lease", summary="Take the free lease", operation_id="acquire_lease", tags=["lease"], openapi_extra=HOLDER_SCHEMA
 )
 async def acquire_lease(state: State, request: HolderBody) -> GrantView:
-    return _grant(state.service.lease.acquire(request.holder))
+    return _grant(await state.act(functools.partial(state.service.lease.acquire, request.holder)))
 
 
 @router.post("/lease/heartbeat", summary="Renew the lease", operation_id="renew_lease", tags=["lease"])
@@ -41,7 +41,7 @@ async def renew_lease(state: State, lease_token: OwnToken) -> GrantView:
 
 @router.post("/lease/release", summary="Give the lease back", operation_id="release_lease", tags=["lease"])
 async def release_lease(state: State, lease_token: OwnToken) -> LeaseView:
-    state.service.lease.release(lease_token)
+    await state.act(functools.partial(state.service.lease.release, lease_token))
     return _lease(state)
 
 

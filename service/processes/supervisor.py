@@ -92,7 +92,8 @@ class Supervisor:
         inline: whether to run the cell and the stop port in this process.
         runs_dir: folder of the calibration records found here; None to use only those of the cell file.
         partial: whether to go on without devices that do not connect; see `missing`.
-        report: called for each start, unexpected end, stop and reset.
+        report: called for each start and unexpected end, and for each stop at the stop port.
+        commit: called before a reset, which is refused when it raises, and before a stop is acknowledged.
         record: the recorder to which the cell tells every call; None to record nothing.
         replay: starts the recorded cell in place of the devices of `cell`; needs `inline`.
     """
@@ -107,6 +108,7 @@ class Supervisor:
         runs_dir: Path | None = None,
         partial: bool = False,
         report: Report = lambda _kind, _data: None,
+        commit: Report = lambda _kind, _data: None,
         record: Endpoint | None = None,
         replay: Callable[[], CellRuntime] | None = None,
     ) -> None:
@@ -117,6 +119,7 @@ class Supervisor:
         self._runs_dir = runs_dir
         self._partial = partial
         self._report = report
+        self._commit = commit
         self._missing: dict[str, MissingDevice] = {}
         self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
         self.latch = Latch.create(self._folder / "latch")
@@ -183,8 +186,13 @@ class Supervisor:
 
     def stop(self, source: str) -> LatchState:
         """Latch the software stop."""
-        state = self._stop.stop(source)
-        self.note_stop()
+        with self._noting:  # so that this call records the stop, and not the watch, which does not wait for the disk
+            state = self._stop.stop(source)
+            self._noted, self._noted_s = state.count, time.monotonic()
+        try:
+            self._commit("stop", {"source": state.source, "count": state.count})
+        except CellError as error:  # the stop holds, with or without a record
+            log.error("the stop is latched but not recorded: %s", error.for_people())
         return state
 
     def note_stop(self) -> None:
@@ -208,18 +216,21 @@ class Supervisor:
 
         Raises:
             MotionRefused: the stop was latched again meanwhile, or the stop process is down or does not answer.
+            JournalError: the reset cannot be recorded, so the stop stays latched.
         """
         self.note_stop()  # before the reset overwrites the latch's record
         if seen_count is None:
             seen_count = self._count_of_old_stop()
         if not self._stop.is_alive():
             raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
+        told = {"source": source, "count": seen_count}
+        self._commit("stop-reset", told)
         if not self._stop.reset(source, seen_count=seen_count):
+            self._report("stop-reset-refused", told)
             raise MotionRefused(
                 f"the stop was pressed again or reset since count {seen_count}, so this reset does nothing",
                 hint="look at the cell, GET /v1/stop, then reset with its newest `count`",
             )
-        self._report("stop-reset", {"source": source, "count": seen_count})
         return self.latch.state()
 
     def _count_of_old_stop(self) -> int:

@@ -67,7 +67,7 @@ class Journal:
         self._thread.start()
         ready.result()
 
-    def append(self, kind: str, data: dict[str, Any]) -> None:
+    def append(self, kind: str, data: dict[str, Any], *, timeout_s: float = APPEND_TIMEOUT_S) -> None:
         """Record durably and return after the commit.
 
         Raises:
@@ -76,10 +76,10 @@ class Journal:
         try:
             done: Future[None] = Future()
             self._put(kind, data, done)
-            done.result(APPEND_TIMEOUT_S)
+            done.result(timeout_s)
         except TimeoutError as error:
             raise JournalError(
-                f"the journal {self.path} did not store a record within {APPEND_TIMEOUT_S:.0f} s",
+                f"the journal {self.path} did not store a record within {timeout_s:.0f} s",
                 hint="the disk is too slow or hangs; nothing may move without a record",
             ) from error
 

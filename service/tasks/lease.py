@@ -31,7 +31,8 @@ class LeaseDesk:
         ttl_s: the lease lapses after this time without a heartbeat.
         on_loss: called with a reason when a holder loses the lease by lapse or take-over; stops the holder's tasks.
         others: returns a sentence about a motion task (running or queued) that this holder did not start, or None.
-        report: called for each grant, take-over, release and lapse.
+        report: called for each lapse.
+        commit: called before each grant, take-over and release, which do not happen when it raises.
     """
 
     def __init__(
@@ -42,12 +43,14 @@ class LeaseDesk:
         on_loss: Callable[[str], None] = lambda _reason: None,
         others: Callable[[str], str | None] = lambda _holder: None,
         report: Callable[[str, dict[str, Any]], None] = lambda _kind, _data: None,
+        commit: Callable[[str, dict[str, Any]], None] = lambda _kind, _data: None,
     ) -> None:
         self.ttl_s = ttl_s
         self._clock = clock or WallClock()
         self._on_loss = on_loss
         self._others = others
         self._report = report
+        self._commit = commit
         self._lock = threading.RLock()
         self._epoch = 0
         self._holder: str | None = None
@@ -108,7 +111,7 @@ class LeaseDesk:
         self.expire()
         with self._lock:
             self.check(token)
-            self._report("lease-released", {"holder": self._holder, "epoch": self._epoch})
+            self._commit("lease-released", {"holder": self._holder, "epoch": self._epoch})
             self._holder, self._token = None, ""
 
     def check(self, token: str | None) -> str | None:
@@ -151,7 +154,7 @@ class LeaseDesk:
         self._on_loss(f"the lease of {lost} lapsed: no heartbeat for {self.ttl_s:g} s")
 
     def _grant(self, holder: str, kind: str) -> Grant:
-        self._report(kind, {"holder": holder, "before": self._holder, "epoch": self._epoch + 1})
+        self._commit(kind, {"holder": holder, "before": self._holder, "epoch": self._epoch + 1})
         self._epoch += 1
         self._holder = holder
         self._token = f"{self._epoch}.{secrets.token_urlsafe(16)}"

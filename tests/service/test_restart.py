@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from hal.config import load_cell
 from hal.errors import InvalidRequest
 from service.core import Service
+from service.errors import JournalError
 from service.tasks.model import TaskState
 from tests.service.conftest import WriteCell
 from tests.service.verbs import OPERATIONS, EchoRequest, FailRequest, HoldRequest
@@ -118,12 +120,6 @@ def test_starts_stops_and_resets_are_on_record(write_cell: WriteCell, tmp_path: 
 def test_a_journal_that_cannot_be_written_lets_nothing_start_and_the_stop_works(
     write_cell: WriteCell, tmp_path: Path
 ) -> None:
-    import sqlite3
-
-    import pytest
-
-    from service.errors import JournalError
-
     service = _service(write_cell(robot=True), tmp_path / "runs")
     try:
         with sqlite3.connect(service.journal.path) as db:
@@ -132,5 +128,36 @@ def test_a_journal_that_cannot_be_written_lets_nothing_start_and_the_stop_works(
             service.submit("hold", HoldRequest(seconds=0.1))
         assert service.tasks.all() == []
         assert service.supervisor.stop("test").is_latched
+        with pytest.raises(JournalError, match="disk full"):
+            service.supervisor.reset("test", seen_count=service.supervisor.latch.state().count)
+        assert service.supervisor.latch.is_set()
+        with pytest.raises(JournalError, match="disk full"):
+            service.lease.acquire("alice")
+        assert service.lease.holder()[0] is None
+    finally:
+        service.close()
+
+
+def test_what_is_acknowledged_is_on_disk_at_that_moment(
+    write_cell: WriteCell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill right behind the answer loses nothing."""
+    service = _service(write_cell(), tmp_path / "runs")
+    committed: list[str] = []
+    monkeypatch.setattr(service.journal, "note", lambda _kind, _data: None)  # only what an answer waits for is written
+
+    def newest() -> str:
+        return service.journal.records()[-1].kind
+
+    try:
+        lease = service.lease.acquire("alice")
+        committed.append(newest())
+        service.lease.release(lease.token)
+        committed.append(newest())
+        count = service.supervisor.stop("test").count
+        committed.append(newest())
+        service.supervisor.reset("test", seen_count=count)
+        committed.append(newest())
+        assert committed == ["lease-acquired", "lease-released", "stop", "stop-reset"]
     finally:
         service.close()

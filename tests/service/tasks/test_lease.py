@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from hal.clock import SimClock
 from hal.errors import LeaseError
-from service.errors import StaleEpoch
+from service.errors import JournalError, StaleEpoch
 from service.tasks.lease import Grant, LeaseDesk
 
 TTL_S = 2.0
@@ -98,7 +98,9 @@ def test_holder_epoch_and_what_is_left_are_told() -> None:
 def test_every_grant_and_its_end_are_reported_with_the_epoch() -> None:
     told: list[tuple[str, dict[str, Any]]] = []
     clock = SimClock()
-    lease = LeaseDesk(ttl_s=TTL_S, clock=clock, report=lambda kind, data: told.append((kind, data)))
+    lease = LeaseDesk(
+        ttl_s=TTL_S, clock=clock, report=lambda *row: told.append(row), commit=lambda *row: told.append(row)
+    )
     lease.acquire("alice")
     lease.release(lease.take_over("bob").token)
     lease.acquire("carol")
@@ -112,6 +114,26 @@ def test_every_grant_and_its_end_are_reported_with_the_epoch() -> None:
         ("lease-lapsed", {"holder": "carol", "epoch": 3}),
         ("lease-acquired", {"holder": "dave", "before": None, "epoch": 4}),
     ]
+
+
+def test_nothing_is_granted_or_given_back_without_a_record() -> None:
+    is_full = [True]
+
+    def commit(_kind: str, _data: dict[str, Any]) -> None:
+        if is_full[0]:
+            raise JournalError("the disk is full", hint="free space")
+
+    lease = LeaseDesk(ttl_s=TTL_S, clock=SimClock(), commit=commit)
+    with pytest.raises(JournalError):
+        lease.acquire("alice")
+    assert lease.holder() == (None, 0, 0.0)
+    is_full[0] = False
+    token = lease.acquire("alice").token
+    is_full[0] = True
+    for refused in (lambda: lease.take_over("bob"), lambda: lease.release(token)):
+        with pytest.raises(JournalError):
+            refused()
+    assert lease.holder() == ("alice", 1, TTL_S)
 
 
 def test_while_another_ones_task_moves_the_lease_is_not_free_but_can_be_taken_over() -> None:

@@ -31,7 +31,7 @@ from hal.errors import MotionError, NotFound, Stopped
 from hal.geometry import UncertainPose
 from manipulation import SkillFailure, plausibility, proximity_probe, touch_points, touch_probe
 from service.operations.acquisition import settle
-from service.operations.find_panel import Located, locate, panel_observations
+from service.operations.find_panel import locate, panel_observations
 from service.operations.inspect import ensure_located
 from service.operations.locate import go_to_overview, scan_plate
 from service.operations.session import Session
@@ -79,10 +79,9 @@ def run_fuse(session: Session, request: FuseRequest) -> FuseResult:
         observations, felt = collect(session, request)
         return fused_result(fuse_and_remember(session, observations), felt)
     measurements = [body.measurement() for body in request.measurements]
-    prior = request.prior.pose() if request.prior is not None else None
     fused = fuse(
         measurements,
-        prior=prior,
+        prior=request.prior.pose() if request.prior is not None else None,
         shape=request.shape.shape() if request.shape is not None else None,
         certify=request.certify,
         prove_set_within_s=request.prove_set_within_s,
@@ -94,8 +93,7 @@ def collect(session: Session, request: FuseRequest) -> tuple[tuple[Observation, 
     """Take images, scan, hover and touch; returns all observations, and the result of touching."""
     ensure_located(session.part(0.0, 0.2))
     go_to_overview(session)
-    found: Located = locate(session.part(0.2, 0.3))
-    known: tuple[Observation, ...] = panel_observations([found])
+    known: tuple[Observation, ...] = panel_observations([locate(session.part(0.2, 0.3))])
     if session.cell.names_of(DeviceKind.RANGE_SCANNER):
         session.progress(0.3, "scan the plate")
         known = (*known, scan_plate(session).observation)
@@ -283,13 +281,12 @@ def _feel_at(session: Session, spot: Array, monitor: plausibility.ProximityMonit
         if finding is not None:
             raise finding.error()
     base_from_grip = touched.report.base_from_tool
-    tip = base_from_grip.inv().apply(touched.point_m)
     normal_sigma = float(np.sqrt(touched.normal @ touched.covariance @ touched.normal))
     observations.append(
         TouchObservation(
             sensor=session.first(DeviceKind.GRIPPER),
             base_from_flange=base_from_grip * context.flange_from_grip.inv(),
-            tip_m=tip,
+            tip_m=base_from_grip.inv().apply(touched.point_m),
             sigma_m=normal_sigma,
             label=f"touch at ({spot[0]:.3f}, {spot[1]:.3f})",
         )

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.kinds.cameras import LensOptions, Pixels, nominal, to_pixels
-from drivers.kinds.file_player import FilePlayer
+from drivers.kinds.file_player import FilePlayer, undamaged_png
 from drivers.transport.options import read_options
 from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
@@ -96,7 +98,7 @@ class CameraFiles(FilePlayer[Image]):
             )
         frame = self._frames[index % len(self._frames)]
         if isinstance(frame, Path):
-            raw = cv2.imread(str(frame), cv2.IMREAD_COLOR)
+            raw = _read(frame)
             if raw is None:
                 self.errors += 1
                 raise DeviceFault(
@@ -115,6 +117,16 @@ class CameraFiles(FilePlayer[Image]):
 
     def _missing(self, what: str, hint: str) -> DeviceUnavailable:
         return DeviceUnavailable(f"{self.name}: {what}", hint=hint, device=self.name)
+
+
+def _read(path: Path) -> NDArray[Any] | None:
+    """Return the pixels as OpenCV gives them; None if the file is damaged or missing."""
+    try:
+        content = path.read_bytes()
+        content = undamaged_png(content) if path.suffix.lower() == ".png" else content
+    except (OSError, ValueError):
+        return None
+    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
 
 
 @takes(CameraFilesOptions)

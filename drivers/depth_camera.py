@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.kinds.file_player import FilePlayer
+from drivers.kinds.file_player import FilePlayer, undamaged_png
 from drivers.transport.options import read_options
 from hal.arrays import Array
 from hal.clock import Deadline
@@ -118,7 +118,7 @@ class DepthCamera(FilePlayer[RangeImage]):
 
 def _read(path: Path, unit_m: float) -> Array:
     if path.suffix == ".png":
-        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        raw = cv2.imdecode(np.frombuffer(undamaged_png(path.read_bytes()), np.uint8), cv2.IMREAD_UNCHANGED)
         if raw is None or raw.dtype != np.uint16:
             raise ValueError("not a PNG of 16 bits")
         return np.asarray(raw, dtype=np.float64) * unit_m

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from drivers.emulators.base import WireEmulator
 from drivers.emulators.faults import WireFault
 
 
@@ -15,13 +14,17 @@ class Bench:
     """Test setup of one device: emulator, driver, options, and a check that a value is one of the latest true ones."""
 
     name: str
-    start: Callable[[Any, dict[str, Any]], WireEmulator]
+    start: Callable[[Any, dict[str, Any]], Any]  # returns a `WireEmulator`, or what has its address and `close`
     backing: Callable[[], Any]
     driver: str
     is_true: Callable[[Any, Any], bool]
     options: dict[str, Any] = field(default_factory=dict)
     far_options: dict[str, Any] = field(default_factory=dict)
     faults: tuple[WireFault, ...] = tuple(WireFault)
+    read: Callable[[Any, Any], Any] = lambda device, deadline: device.newest(deadline)
+    """Reads the device until a deadline."""
+    is_plugged: bool = True
+    """Whether the far side can be unplugged."""
     taken_s: Callable[[Any, Any], float] | None = None
     """Returns when a value was taken (monotonic clock); None if the value or the protocol does not reveal it."""
     stamps: Literal["log", "own log", "taken"] | None = "log"

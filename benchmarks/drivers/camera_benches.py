@@ -1,13 +1,19 @@
-"""Test setups of cameras: an MJPEG sender of ours whose pictures carry their number.
+"""Test setups of cameras: an MJPEG sender of ours and folders of pictures, all of which carry their number.
 
 TCP neither loses nor changes bytes, so `drop` is a picture that the camera itself has cut short, and `crc` a damaged line
-between two pictures; a flipped bit within a JPEG picture shows in nothing.
+between two pictures; a flipped bit within a JPEG picture shows in nothing. Of a folder some pictures are damaged, cut
+short, there twice or missing.
 """
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 import time
 from collections import deque
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -17,9 +23,9 @@ from pydantic import Field
 
 from benchmarks.drivers.bench import WITHOUT_ECHO, Bench
 from drivers.emulators.base import WireEmulator
-from drivers.emulators.faults import FaultOptions
+from drivers.emulators.faults import FaultOptions, FaultPlan, WireFault
 from drivers.emulators.ports import Peer, TcpPort
-from hal.devices import Image
+from hal.devices import Image, RangeImage
 from hal.strict import validate
 
 RATE_HZ = 50.0
@@ -40,9 +46,14 @@ class NumberedPictures:
         """Return the time and the next picture."""
         self._count += 1
         self._taken_s.append(time.monotonic())
-        bits = self._count >> np.arange(BITS) & 1
+        return self._taken_s[-1], self.drawn(self._count)
+
+    @staticmethod
+    def drawn(number: int) -> NDArray[np.uint8]:
+        """Return the picture of a number."""
+        bits = number >> np.arange(BITS) & 1
         squares = np.stack([bits, 1 - bits]) * 255
-        return self._taken_s[-1], np.kron(squares, np.ones((BLOCK_PX, BLOCK_PX))).astype(np.uint8)
+        return np.kron(squares, np.ones((BLOCK_PX, BLOCK_PX))).astype(np.uint8)
 
     def is_true(self, value: Image) -> bool:
         """Return whether a picture is whole and one of the last ones."""
@@ -116,6 +127,64 @@ def start(backing: NumberedPictures, options: dict[str, Any]) -> MjpegSender:
     return sender
 
 
+PICTURES, PLAYED_HZ = 100, 200.0
+OF_FILES = (WireFault.CRC, WireFault.DROP, WireFault.DUP, WireFault.DISCONNECT)
+FIRST_MM = 1000  # depth of the first picture of a folder, and one more for each that follows
+LENS = {"fx": 30.0, "fy": 30.0, "cx": 16.0, "cy": 8.0}
+
+
+class Folder:
+    """Folder of numbered PNG pictures, in which a fault concerns every so manyth."""
+
+    def __init__(self, picture: Callable[[int], NDArray[Any]], more: dict[str, Any], options: dict[str, Any]) -> None:
+        self._path = Path(tempfile.mkdtemp(prefix="panelwright-"))
+        self.address = {"path": str(self._path), "rate_hz": PLAYED_HZ, **more}
+        plan = FaultPlan(validate(options, FaultOptions, source="far side"))
+        for number in range(PICTURES):
+            content = bytes(cv2.imencode(".png", picture(number))[1])
+            path = self._path / f"{number:06d}.png"
+            match plan.next() if number else None:  # the first one gives the size
+                case WireFault.CRC:
+                    path.write_bytes(plan.flip_bit(content, slice(None)))
+                case WireFault.DROP:
+                    path.write_bytes(plan.lose_bytes(content))
+                case WireFault.DISCONNECT:
+                    path.symlink_to("away")
+                case WireFault.DUP:
+                    path.write_bytes((self._path / f"{number - 1:06d}.png").read_bytes() if number else content)
+                case _:
+                    path.write_bytes(content)
+
+    def close(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self._path, ignore_errors=True)
+
+
+def _depth_of(number: int) -> NDArray[np.uint16]:
+    return np.full((16, 32), FIRST_MM + number, np.uint16)
+
+
+def _picture_of(number: int) -> NDArray[np.uint8]:
+    return NumberedPictures.drawn(number)
+
+
+def start_folder(
+    picture: Callable[[int], NDArray[Any]], more: dict[str, Any], _: None, options: dict[str, Any]
+) -> Folder:
+    """Write a folder of pictures."""
+    return Folder(picture, more, options)
+
+
+def _is_picture(value: Image, _: None) -> bool:
+    number = _number(value)
+    return number is not None and number < PICTURES
+
+
+def _is_depth(value: RangeImage, _: None) -> bool:
+    counts = np.round(value.depth_m * 1000.0)
+    return bool(np.all(counts == counts[0, 0]) and FIRST_MM <= counts[0, 0] < FIRST_MM + PICTURES)
+
+
 def _is_true(value: Image, backing: NumberedPictures) -> bool:
     return backing.is_true(value)
 
@@ -124,18 +193,37 @@ def _taken_s(value: Image, backing: NumberedPictures) -> float:
     return backing.taken_s(value)
 
 
-CAMERA_BENCHES = tuple(
-    Bench(
-        name=f"mjpeg {word}",
-        start=start,
-        backing=NumberedPictures,
-        driver="stream:camera",
-        is_true=_is_true,
-        taken_s=_taken_s,
-        stamps="taken",
-        options={"rate_hz": RATE_HZ, "latency_s": 0.0},
-        far_options={"has_stamps": has_stamps},
-        faults=WITHOUT_ECHO,
-    )
-    for word, has_stamps in (("by arrival", False), ("by stamps", True))
+CAMERA_BENCHES = (
+    *(
+        Bench(
+            name=f"mjpeg {word}",
+            start=start,
+            backing=NumberedPictures,
+            driver="stream:camera",
+            is_true=_is_true,
+            taken_s=_taken_s,
+            stamps="taken",
+            options={"rate_hz": RATE_HZ, "latency_s": 0.0},
+            far_options={"has_stamps": has_stamps},
+            faults=WITHOUT_ECHO,
+        )
+        for word, has_stamps in (("by arrival", False), ("by stamps", True))
+    ),
+    *(
+        Bench(
+            name=name,
+            start=partial(start_folder, picture, more),
+            backing=lambda: None,
+            driver=driver,
+            is_true=is_true,
+            faults=OF_FILES,
+            read=lambda device, deadline: device.play(deadline),
+            stamps=None,
+            is_plugged=False,
+        )
+        for name, driver, picture, more, is_true in (
+            ("pictures", "files:camera", _picture_of, {"repeat": True}, _is_picture),
+            ("depth pictures", "files:depth", _depth_of, LENS, _is_depth),
+        )
+    ),
 )

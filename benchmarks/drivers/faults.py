@@ -162,7 +162,7 @@ class Reader:
         started_s = time.monotonic()
         sample: Stamped[Any] | None = None
         try:
-            sample = self._device.newest(deadline())
+            sample = self._item.read(self._device, deadline())
         except CellError:
             self._cell.errors += 1
         except Exception as error:

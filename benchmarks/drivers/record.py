@@ -204,7 +204,9 @@ def faults_of(item: Bench, cells: dict[Key, Cell], seconds: float) -> FaultMatri
 
 
 def replug_of(item: Bench, times: int) -> Replug | None:
-    """Unplug the setup repeatedly; None if the driver does not connect."""
+    """Unplug the setup repeatedly; None if it has no plug or the driver does not connect."""
+    if not item.is_plugged:
+        return None
     try:
         found = unplugging(item, times)
     except CellError as error:

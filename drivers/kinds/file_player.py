@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import threading
+import zlib
 from abc import abstractmethod
 from pathlib import Path
 from typing import TypeVar
@@ -15,6 +17,7 @@ from hal.readings import Stamped
 from hal.registry import Context
 
 T = TypeVar("T")
+PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class FilePlayer(WireDevice[T]):
@@ -57,8 +60,8 @@ class FilePlayer(WireDevice[T]):
                 raise self.timeout(now_s() - started_s)
             shown_s = now_s()
             self._next_s = shown_s + self._period_s
-            self.show(self._index, shown_s)
-            self._index += 1
+            index, self._index = self._index, self._index + 1  # a damaged file does not keep those behind it
+            self.show(index, shown_s)
             return self.newest(deadline, not_before_s=-float("inf"))
         finally:
             self._turn.release()
@@ -78,3 +81,24 @@ class FilePlayer(WireDevice[T]):
     def link_name(self) -> str:
         """Return `files` and the path."""
         return f"files {self._path}"
+
+
+def undamaged_png(content: bytes) -> bytes:
+    """Return the content of a PNG file, all of whose chunks have the right check sum.
+
+    One wrong bit in the first chunk may make a small picture gigabytes large, which takes longer than any deadline.
+
+    Raises:
+        ValueError: it is damaged, or no PNG.
+    """
+    at, kind = len(PNG), b""
+    while content.startswith(PNG) and kind != b"IEND" and len(content) >= at + 12:
+        (length,), kind = struct.unpack_from(">I", content, at), content[at + 4 : at + 8]
+        end = at + 8 + length
+        if content[end : end + 4] != struct.pack(">I", zlib.crc32(content[at + 4 : end])):
+            break
+        at = end + 4
+    else:
+        if kind == b"IEND":
+            return content
+    raise ValueError("a damaged PNG")

@@ -29,7 +29,7 @@ from hal.wires import ResourceClaim, WireOptions
 
 PAUSE_S, PAUSE_PERIODS = 0.1, 3.0
 WAITED_PERIODS = 0.5  # a picture that had to be waited for this long was not lying in a buffer
-GAPS = 15
+GAPS, LEAST_GAPS = 15, 2
 SILENCE_S = 1.0
 CONNECT_S = 10.0  # FFmpeg looks at some seconds of a stream
 LOW_DELAY = {"fflags": "nobuffer", "flags": "low_delay", "analyzeduration": "500000", "probesize": "500000"}
@@ -89,8 +89,11 @@ class Freshness:
         gap_s, self._last_s = arrived_s - self._last_s, arrived_s
         if math.isinf(gap_s):
             return False
+        usual_s = (
+            statistics.median_low(self._gaps_s) if len(self._gaps_s) >= LEAST_GAPS else 0.0
+        )  # not by this gap itself
         self._gaps_s.append(gap_s)
-        period_s = max(self._period_s, statistics.median(self._gaps_s))
+        period_s = max(self._period_s, usual_s)
         if gap_s > max(PAUSE_S, PAUSE_PERIODS * period_s) and not has_stamp:
             self._is_draining = True
             return False

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.camera_v4l2 import CameraV4l2, CameraV4l2Options
+from drivers.kinds.file_player import undamaged_png
 from hal.camera_settings import CameraSettings
 from hal.conformance import CameraContract, RangeScannerContract, Rig
 from hal.errors import DeviceFault, DeviceTimeout, DeviceUnavailable
@@ -144,6 +145,7 @@ def test_a_broken_or_odd_picture_is_a_fault_that_names_it(folder: Path) -> None:
     (folder / "000.png").write_bytes(b"no picture")
     with pytest.raises(DeviceFault, match=r"000\.png"):
         device.read_image(deadline=soon())
+    device.read_image(deadline=soon())  # the next one
     cv2.imwrite(str(folder / "000.png"), picture(1)[:10])
     with pytest.raises(DeviceFault, match="32x10"):
         device._index = 3
@@ -157,6 +159,20 @@ def test_a_damaged_depth_picture_is_a_fault_that_names_the_file(name: str, conte
     lens = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
     with pytest.raises(DeviceFault, match=rf"{name} is not a depth picture"):
         connect(Context(name="depth"), "files:depth", {"path": str(tmp_path), **lens})
+
+
+def test_a_png_with_one_wrong_bit_or_without_its_end_is_refused_before_it_is_decoded() -> None:
+    """One wrong bit in the header may make a small picture gigabytes large."""
+    content = bytes(cv2.imencode(".png", np.full((16, 32), 1200, np.uint16))[1])
+    assert undamaged_png(content) == content
+    for bit in range(8 * len(content)):
+        damaged = bytearray(content)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(ValueError, match="damaged"):
+            undamaged_png(bytes(damaged))
+    for end in range(len(content)):
+        with pytest.raises(ValueError, match="damaged"):
+            undamaged_png(content[:end])
 
 
 def test_depth_formats_agree_and_limits_cut(tmp_path: Path) -> None:

@@ -215,6 +215,11 @@ def test_a_picture_that_lacks_one_byte_is_not_filled_up_by_the_line_break_behind
     assert [faults[n] for n in (0, 1, 2, 5, 6, 9, 10)] == 7 * [None]
 
 
+def test_a_second_picture_that_was_held_up_does_not_set_the_measure_for_itself() -> None:
+    fresh = Freshness(0.02)
+    assert [fresh.is_fresh(at_s, has_stamp=False) for at_s in (0.0, 0.17, 0.19, 0.21)] == [False, False, True, True]
+
+
 class Script:
     """Source of pictures that a test writes."""
 

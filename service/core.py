@@ -22,6 +22,7 @@ from service.errors import NotPossibleNow
 from service.knowledge.calibrations import Calibrations
 from service.operations import Operation, OperationContext
 from service.processes.device_slots import IN_MOTION
+from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
 from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
@@ -80,8 +81,7 @@ class Service:
             inline=inline,
             runs_dir=runs_dir,
             partial=partial,
-            report=self.note,
-            commit=self.commit,
+            records=Records(note=self.note, commit=self.commit),
             record=None if self._recording is None else self._recording.endpoint,
             replay=replay,
         )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion import Observation, PoseTolerance
+from fusion import Observation, PoseTolerance, error_budget
 from hal.devices import DeviceKind
 from hal.errors import CellError, DeviceError, InvalidRequest, PerceptionError, Unreachable
 from hal.geometry import compose
@@ -39,7 +39,7 @@ from service.operations.range_detection import (
     need_its_place,
     view_surfaces,
 )
-from service.operations.sense import feel, fuse_and_remember, fused_result, pose_error
+from service.operations.sense import feel, fuse_and_remember, fused_result, mounts_of
 from service.operations.session import OperationContext, Session
 from service.operations.travel import leave_the_panel, park
 from service.problem import problem_of
@@ -189,13 +189,20 @@ def _find(session: Session, record: MissionRecord, tolerance: PoseTolerance) -> 
             plane = scan_plate(part)
             _note_plane(record, plane)
             found = replace(found, plane=plane, surfaces=view_surfaces(part, plane, OVERVIEW))
-    if pose_error(session, found.observations, tolerance) > 1.0:
+    if _pose_error(session, found.observations, tolerance) > 1.0:
         with _step(session, "square view", 0.13, 0.19) as part:
             part.progress(0.0, "drive to the square view")
             go_to_overview(part)
             found = replace(found, views=(*found.views, locate(part)))
     _note_found(record, found.views[-1])
     return found
+
+
+def _pose_error(session: Session, known: Sequence[Observation], tolerance: PoseTolerance) -> float:
+    """Return the mean square error of the pose that the observations give, in units of the tolerance."""
+    base_from_panel = session.known_panel().parent_from_child
+    budget = error_budget(known, mounts_of(session, known), base_from_panel, lenses=session.one_sigma_lenses())
+    return tolerance.error_of(budget.covariance, base_from_panel)
 
 
 def _work_all(session: Session, record: MissionRecord, request: MissionRequest, checks: Sequence[SurfaceCheck]) -> None:

@@ -193,13 +193,6 @@ def touch_plan(session: Session, touches: int, known: Sequence[Observation], tol
     )
 
 
-def pose_error(session: Session, known: Sequence[Observation], tolerance: PoseTolerance) -> float:
-    """Return the mean square error of the pose that the observations give, in units of the tolerance."""
-    base_from_panel = session.known_panel().parent_from_child
-    budget = error_budget(known, mounts_of(session, known), base_from_panel, lenses=session.one_sigma_lenses())
-    return tolerance.error_of(budget.covariance, base_from_panel)
-
-
 def _expected_at(session: Session, base_from_panel: RigidTransform, spot: Array) -> list[Observation]:
     """Return the observations expected from hovering over a place and touching it, at the estimated panel pose."""
     gripper = session.first(DeviceKind.GRIPPER)

@@ -13,15 +13,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hal.config import Cell, DeviceSection
-from hal.errors import CellError, DeviceTimeout, DeviceUnavailable, MotionRefused
-from hal.isolated import Report
+from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
 from service.processes.cell import MISSING, CellOrder, CellRuntime, error_from_line, note_from_line
 from service.processes.child import Child
 from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
 from service.processes.latch import Beat, Latch, LatchState
+from service.processes.stop_desk import Records, StopDesk, StopHost
 from service.processes.stop_host import InlineStop, ProcessStop
 from service.recording.endpoint import Endpoint
 
@@ -29,37 +29,8 @@ START_TIMEOUT_S = 400.0  # the first start compiles the control kernels, which t
 MAX_RESTARTS = 3
 BEAT_TIMEOUT_S = 10.0  # numba's compiler can hold the interpreter lock for seconds, which delays the beat thread
 WATCH_S = 0.1
-SEEN_S = 1.0  # nobody has seen a stop that is younger
+NO_RECORDS = Records()
 log = logging.getLogger(__name__)
-
-
-class StopHost(Protocol):
-    """The interface of the object that writes the latch."""
-
-    def stop(self, source: str) -> LatchState:
-        """Latch the stop; never fails."""
-        ...
-
-    def reset(self, source: str, *, seen_count: int) -> bool:
-        """Clear the latch unless it was set again after `seen_count`; returns whether it is clear.
-
-        Raises:
-            MotionRefused: the stop process did not answer.
-        """
-        ...
-
-    @property
-    def pid(self) -> int | None:
-        """Process id, or None when it has no process of its own."""
-        ...
-
-    def is_alive(self) -> bool:
-        """Whether the stop port answers requests."""
-        ...
-
-    def close(self) -> None:
-        """End the stop port; the latch stays set."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,8 +63,7 @@ class Supervisor:
         inline: whether to run the cell and the stop port in this process.
         runs_dir: folder of the calibration records found here; None to use only those of the cell file.
         partial: whether to go on without devices that do not connect; see `missing`.
-        report: called for each start and unexpected end, and for each stop at the stop port.
-        commit: called before a reset, which is refused when it raises, and before a stop is acknowledged.
+        records: where starts, unexpected ends, stops and resets are recorded.
         record: the recorder to which the cell tells every call; None to record nothing.
         replay: starts the recorded cell in place of the devices of `cell`; needs `inline`.
     """
@@ -107,8 +77,7 @@ class Supervisor:
         inline: bool = False,
         runs_dir: Path | None = None,
         partial: bool = False,
-        report: Report = lambda _kind, _data: None,
-        commit: Report = lambda _kind, _data: None,
+        records: Records = NO_RECORDS,
         record: Endpoint | None = None,
         replay: Callable[[], CellRuntime] | None = None,
     ) -> None:
@@ -118,8 +87,7 @@ class Supervisor:
         self.inline = inline
         self._runs_dir = runs_dir
         self._partial = partial
-        self._report = report
-        self._commit = commit
+        self._report = records.note
         self._missing: dict[str, MissingDevice] = {}
         self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
         self.latch = Latch.create(self._folder / "latch")
@@ -127,7 +95,7 @@ class Supervisor:
         self._stop: StopHost = (
             InlineStop(self.latch, stop_listener, origins)
             if inline
-            else ProcessStop(self.latch, self._folder / "latch", stop_listener, origins, report=report)
+            else ProcessStop(self.latch, self._folder / "latch", stop_listener, origins, report=records.note)
         )
         self._remote = RemoteConnection(cell)
         self._local: LocalConnection | None = None
@@ -138,9 +106,7 @@ class Supervisor:
         self._is_ready = threading.Event()
         self._is_closing = threading.Event()
         self._lock = threading.RLock()
-        self._noted = self.latch.state().count
-        self._noted_s = time.monotonic()
-        self._noting = threading.Lock()
+        self._desk = StopDesk(self.latch, self._stop, records)
 
     @property
     def connection(self) -> CellConnection:
@@ -185,64 +151,16 @@ class Supervisor:
             threading.Thread(target=self._watch, name="watch-cell", daemon=True).start()
 
     def stop(self, source: str) -> LatchState:
-        """Latch the software stop."""
-        with self._noting:  # so that this call records the stop, and not the watch, which does not wait for the disk
-            state = self._stop.stop(source)
-            self._noted, self._noted_s = state.count, time.monotonic()
-        try:
-            self._commit("stop", {"source": state.source, "count": state.count})
-        except CellError as error:  # the stop holds, with or without a record
-            log.error("the stop is latched but not recorded: %s", error.for_people())
-        return state
+        """Latch the software stop; see `StopDesk.stop`."""
+        return self._desk.stop(source)
 
     def note_stop(self) -> None:
-        """Report the newest stop once, because the stop port writes the latch without reporting.
-
-        Call it periodically; of several stops between two calls only the last one is reported.
-        """
-        with self._noting:
-            state = self.latch.state()
-            if state.count <= self._noted:
-                return
-            self._noted, self._noted_s = state.count, time.monotonic()
-        if state.is_latched:
-            self._report("stop", {"source": state.source, "count": state.count})
+        """Record a stop that was made at the stop port; call it periodically."""
+        self._desk.note_stop()
 
     def reset(self, source: str, *, seen_count: int | None) -> LatchState:
-        """Clear the latch; this alone moves nothing.
-
-        Args:
-            seen_count: the latch's count that the caller has seen; None for whichever stop is older than a second.
-
-        Raises:
-            MotionRefused: the stop was latched again meanwhile, or the stop process is down or does not answer.
-            JournalError: the reset cannot be recorded, so the stop stays latched.
-        """
-        self.note_stop()  # before the reset overwrites the latch's record
-        if seen_count is None:
-            seen_count = self._count_of_old_stop()
-        if not self._stop.is_alive():
-            raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
-        told = {"source": source, "count": seen_count}
-        self._commit("stop-reset", told)
-        if not self._stop.reset(source, seen_count=seen_count):
-            self._report("stop-reset-refused", told)
-            raise MotionRefused(
-                f"the stop was pressed again or reset since count {seen_count}, so this reset does nothing",
-                hint="look at the cell, GET /v1/stop, then reset with its newest `count`",
-            )
-        return self.latch.state()
-
-    def _count_of_old_stop(self) -> int:
-        """Return the latch's count; refuse if it is latched for less time than a person needs to see it."""
-        with self._noting:
-            count, age_s = self._noted, time.monotonic() - self._noted_s
-        if self.latch.is_set() and age_s < SEEN_S:
-            raise MotionRefused(
-                f"the stop was pressed {age_s:.1f} s ago, so it stays latched",
-                hint="look at the cell, GET /v1/stop, then reset with its `count` as `seen_count`",
-            )
-        return count
+        """Clear the latch; see `StopDesk.reset`."""
+        return self._desk.reset(source, seen_count=seen_count)
 
     def swap(self, name: str, section: DeviceSection) -> None:
         """Replace the device called `name`, also for later restarts of the cell process; see `device_slots.Swapper`."""

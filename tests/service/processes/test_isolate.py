@@ -17,6 +17,7 @@ from hal.errors import ConfigError, DeviceUnavailable
 from hal.isolated import IsolatedDevice
 from hal.registry import Context
 from service.processes.cell import CellRuntime, note_from_line, note_to_line
+from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
 from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
@@ -124,7 +125,7 @@ def test_the_crash_is_reported_through_the_cell_process_and_the_cell_lives_on(wr
     path = write_cell(mode="real")
     path.write_text(path.read_text().replace('driver = "fake:proximity"', 'driver = "fake:proximity"\nisolate = true'))
     notes: list[str] = []
-    supervisor = Supervisor(load_cell(path), report=lambda kind, _data: notes.append(kind))
+    supervisor = Supervisor(load_cell(path), records=Records(note=lambda kind, _data: notes.append(kind)))
     try:
         supervisor.start()
         device = supervisor.connection.device(NAME)

@@ -14,6 +14,7 @@ from hal.config import load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable, InvalidRequest, MotionRefused, Unsupported
 from service.processes.cell import CellRuntime, gathered
+from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
 from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
@@ -107,7 +108,7 @@ def test_killing_the_cell_takes_its_world_along_and_latches_the_stop(write_cell:
     events: list[str] = []
     supervisor = Supervisor(
         load_cell(write_cell(options={"panel_lights": {"child_pid_file": str(world_file)}})),
-        report=lambda kind, _data: events.append(kind),
+        records=Records(note=lambda kind, _data: events.append(kind)),
     )
     try:
         supervisor.start()
@@ -164,7 +165,7 @@ def eventually_raises(supervisor: Supervisor) -> None:
 
 def test_a_dead_stop_process_latches_and_comes_back(write_cell: WriteCell) -> None:
     events: list[str] = []
-    supervisor = Supervisor(load_cell(write_cell()), report=lambda kind, _data: events.append(kind))
+    supervisor = Supervisor(load_cell(write_cell()), records=Records(note=lambda kind, _data: events.append(kind)))
     try:
         supervisor.start()
         os.kill(_pid(supervisor, "stop"), signal.SIGKILL)

@@ -1,0 +1,139 @@
+"""Latches and clears the software stop for the service, and records both."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from hal.errors import CellError, MotionRefused
+from hal.isolated import Report
+from service.processes.latch import Latch, LatchState
+
+SEEN_S = 1.0  # nobody has seen a stop that is younger
+log = logging.getLogger(__name__)
+
+
+class StopHost(Protocol):
+    """The interface of the object that writes the latch."""
+
+    def stop(self, source: str) -> LatchState:
+        """Latch the stop; never fails."""
+        ...
+
+    def reset(self, source: str, *, seen_count: int) -> bool:
+        """Clear the latch unless it was set again after `seen_count`; returns whether it is clear.
+
+        Raises:
+            MotionRefused: the stop process did not answer.
+        """
+        ...
+
+    @property
+    def pid(self) -> int | None:
+        """Process id, or None when it has no process of its own."""
+        ...
+
+    def is_alive(self) -> bool:
+        """Whether the stop port answers requests."""
+        ...
+
+    def close(self) -> None:
+        """End the stop port; the latch stays set."""
+        ...
+
+
+def _nowhere(_kind: str, _data: dict[str, Any]) -> None:
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Records:
+    """Where events are recorded.
+
+    Attributes:
+        note: records without waiting for the disk.
+        commit: records and returns when the entry is on disk; raises when it cannot be written.
+    """
+
+    note: Report = _nowhere
+    commit: Report = _nowhere
+
+
+class StopDesk:
+    """Stops, resets and their records; several threads may call it.
+
+    Args:
+        latch: the stop latch, which this object only reads.
+        host: writes the latch.
+    """
+
+    def __init__(self, latch: Latch, host: StopHost, records: Records) -> None:
+        self._latch = latch
+        self._host = host
+        self._records = records
+        self._noted = latch.state().count
+        self._noted_s = time.monotonic()
+        self._noting = threading.Lock()
+
+    def stop(self, source: str) -> LatchState:
+        """Latch the software stop; returns when it is also recorded, if that is possible."""
+        with self._noting:  # so that this call records the stop, and not `note_stop`, which does not wait for the disk
+            state = self._host.stop(source)
+            self._noted, self._noted_s = state.count, time.monotonic()
+        try:
+            self._records.commit("stop", {"source": state.source, "count": state.count})
+        except CellError as error:  # the stop holds, with or without a record
+            log.error("the stop is latched but not recorded: %s", error.for_people())
+        return state
+
+    def note_stop(self) -> None:
+        """Record the newest stop once, because the stop port writes the latch without recording.
+
+        Call it periodically; of several stops between two calls only the last one is recorded.
+        """
+        with self._noting:
+            state = self._latch.state()
+            if state.count <= self._noted:
+                return
+            self._noted, self._noted_s = state.count, time.monotonic()
+        if state.is_latched:
+            self._records.note("stop", {"source": state.source, "count": state.count})
+
+    def reset(self, source: str, *, seen_count: int | None) -> LatchState:
+        """Clear the latch; this alone moves nothing.
+
+        Args:
+            seen_count: the latch's count that the caller has seen; None for whichever stop is older than a second.
+
+        Raises:
+            MotionRefused: the stop was latched again meanwhile, or the stop process is down or does not answer.
+            JournalError: the reset cannot be recorded, so the stop stays latched.
+        """
+        self.note_stop()  # before the reset overwrites the latch's record
+        if seen_count is None:
+            seen_count = self._count_of_old_stop()
+        if not self._host.is_alive():
+            raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
+        told = {"source": source, "count": seen_count}
+        self._records.commit("stop-reset", told)
+        if not self._host.reset(source, seen_count=seen_count):
+            self._records.note("stop-reset-refused", told)
+            raise MotionRefused(
+                f"the stop was pressed again or reset since count {seen_count}, so this reset does nothing",
+                hint="look at the cell, GET /v1/stop, then reset with its newest `count`",
+            )
+        return self._latch.state()
+
+    def _count_of_old_stop(self) -> int:
+        """Return the latch's count; refuse if it is latched for less time than a person needs to see it."""
+        with self._noting:
+            count, age_s = self._noted, time.monotonic() - self._noted_s
+        if self._latch.is_set() and age_s < SEEN_S:
+            raise MotionRefused(
+                f"the stop was pressed {age_s:.1f} s ago, so it stays latched",
+                hint="look at the cell, GET /v1/stop, then reset with its `count` as `seen_count`",
+            )
+        return count

@@ -31,12 +31,14 @@ class Facts:
         base_from_panel: pose of the panel with covariance; None until the panel has been located.
         readings: newest conclusive reading of each object, by the object's name.
         frames: newest frame of each camera and range scanner, by the device's name.
+        turned_rad: angle with its whole turns, by name, of each wheel that was turned; a look shows one turn only.
         kinematics: of the cell's arm; None until first needed.
     """
 
     base_from_panel: UncertainPose | None = None
     readings: Mapping[str, ObjectReading] = field(default_factory=lambda: MappingProxyType({}))
     frames: Mapping[str, FrameDigest] = field(default_factory=lambda: MappingProxyType({}))
+    turned_rad: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     kinematics: Kinematics | None = None
 
 
@@ -78,6 +80,15 @@ class WorldModel:
             )
         )
 
+    @property
+    def turned_rad(self) -> Mapping[str, float]:
+        """The angle with its whole turns of each wheel that was turned, by name."""
+        return self._facts.turned_rad
+
+    def note_turned(self, name: str, angle_rad: float) -> None:
+        """Store the angle, with its whole turns, to which a wheel was turned."""
+        self._change(lambda facts: replace(facts, turned_rad=MappingProxyType({**facts.turned_rad, name: angle_rad})))
+
     def note_frame(self, device: str, frame: FrameDigest) -> FrameDigest | None:
         """Store the newest frame of a sensor; returns the previous one."""
         before = self._change(lambda facts: replace(facts, frames=MappingProxyType({**facts.frames, device: frame})))
@@ -92,8 +103,11 @@ class WorldModel:
         return known
 
     def forget(self) -> None:
-        """Drop all facts, because the panel or the arm may have been exchanged."""
-        self._change(lambda _facts: Facts())
+        """Drop all facts but the whole turns of wheels, because the panel or the arm may have been exchanged.
+
+        No look shows whole turns; a skill believes them as long as a look does not contradict them.
+        """
+        self._change(lambda facts: Facts(turned_rad=facts.turned_rad))
 
     def _change(self, change: Callable[[Facts], Facts]) -> Facts:
         """Replace the facts by the result of `change`; returns the previous facts."""

@@ -27,6 +27,8 @@ class PanelObject(Strict, ABC):
 
     value_is_angle: ClassVar[bool] = False
     """Whether a value of the object is an angle in radians rather than a value of a scale."""
+    turns_round: ClassVar[bool] = False
+    """Whether it may turn more than once round; an image shows its angle within one turn only."""
     is_round: ClassVar[bool] = False
     """Whether its outline is drawn as a circle where it has no `rim`."""
     can_be_lit: ClassVar[bool] = False

@@ -32,7 +32,16 @@ class Handwheel(PanelObject):
     hub_m: Annotated[Positive, Field(description="radius of the hub")] = 0.009
     spoke_m: Annotated[Positive, Field(description="half the thickness of a spoke")] = 0.003
 
+    starts_upright: Annotated[
+        bool,
+        Field(
+            description="whether a wheel that has not been turned yet is within half a turn of 0; if not, its whole turns "
+            "are unknown, and an angle that they could make ambiguous is refused"
+        ),
+    ] = True
+
     value_is_angle: ClassVar[bool] = True
+    turns_round: ClassVar[bool] = True
     asked: ClassVar[tuple[Question, ...]] = (Question(key="spokes", text="How many spokes?", default="3"),)
 
     @model_validator(mode="after")

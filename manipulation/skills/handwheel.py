@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -39,6 +39,7 @@ FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
 GRIP_N = (20.0, 50.0)  # smallest and largest force of the pads; above 60 N the soft pads of the bench slip over the rim
 TOLERANCE_RAD = np.radians(6.0)
 AT_STOP_RAD = 0.35
+SAME_RAD = 0.6  # a look that differs by more from where the wheel was left shows that somebody else has turned it
 TURN_RAD = 2.0 * np.pi
 
 
@@ -79,7 +80,7 @@ def handwheel(
         verify: the caller's read-back.
 
     Raises:
-        InvalidRequest: the target is beyond the wheel's stops, or its present angle is not known.
+        InvalidRequest: the target is beyond the wheel's stops, or its present angle or whole turns are not known.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name = wheel.name
@@ -88,14 +89,23 @@ def handwheel(
             f"{target_rad:.2f} rad is beyond the stops of {name}",
             hint=f"{wheel.minimum_rad:.2f} to {wheel.maximum_rad:.2f} rad",
         )
+    seen = current if current is not None or verify is None else verify()
+    if seen is not None:
+        seen = replace(seen, angle_rad=believed_angle(wheel, seen))
     where = InitialState(
-        lambda seen: seen.angle_rad, what=f"the angle of {name}", current=current, verify=verify, period=TURN_RAD
+        lambda look: look.angle_rad, what=f"the angle of {name}", current=seen, verify=verify, period=TURN_RAD
     )
     belief = _Belief(effort_nm=wheel.torque_nm)
 
     def stroke(attempt: Attempt) -> float:
-        while abs(target_rad - where.known) > 0.3 * TOLERANCE_RAD:
-            _turn_once(attempt, wheel, where, belief, target_rad - where.known)
+        try:
+            while abs(target_rad - where.known) > 0.3 * TOLERANCE_RAD:
+                _turn_once(attempt, wheel, where, belief, target_rad - where.known)
+        except SkillFailure as failure:
+            failure.reached = where.known  # the whole turns so far must not be lost
+            raise
+        except Unreachable as failure:
+            raise SkillFailure(Outcome.UNREACHABLE, f"{failure.what}; {failure.hint}", reached=where.known) from failure
         return where.known
 
     return perform(
@@ -107,6 +117,31 @@ def handwheel(
         is_reached=lambda seen: surely_within(where.known, target_rad, TOLERANCE_RAD, sigma=seen.sigma),
         verify=where.verify,
     )
+
+
+def believed_angle(wheel: Handwheel, seen: ObjectState) -> float | None:
+    """Return the angle with its whole turns: those tracked so far, or those nearest to upright.
+
+    Raises:
+        InvalidRequest: the whole turns are unknown.
+    """
+    if seen.angle_rad is None:
+        return None
+    if seen.turned_rad is not None:
+        near = seen.angle_rad + TURN_RAD * round((seen.turned_rad - seen.angle_rad) / TURN_RAD)
+        if abs(near - seen.turned_rad) < SAME_RAD:
+            return float(near)
+    possible = [
+        seen.angle_rad + TURN_RAD * k
+        for k in range(-20, 21)
+        if wheel.minimum_rad - SAME_RAD <= seen.angle_rad + TURN_RAD * k <= wheel.maximum_rad + SAME_RAD
+    ]
+    if not wheel.starts_upright and len(possible) > 1:
+        raise InvalidRequest(
+            f"the whole turns of {wheel.name} are not known: an image shows its angle within one turn only",
+            hint="bring it within half a turn of 0 by hand and set starts_upright in the panel file",
+        )
+    return min(possible, key=abs, default=seen.angle_rad)
 
 
 def _turn_once(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: _Belief, span_rad: float) -> None:
@@ -127,8 +162,7 @@ def _turn_once(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: 
         where.moved_to(angle_rad + sign * turn.moved_rad)
         belief.feel(turn.felt_nm)
     except SkillFailure as failure:
-        where.moved_to(_at_a_stop(wheel, angle_rad + sign * turn.moved_rad, sign, failure.outcome))
-        failure.reached = where.known
+        where.moved_to(at_a_stop(wheel, angle_rad + sign * turn.moved_rad, sign, failure.outcome))
         belief.feel(turn.felt_nm)
         if not by_spokes or failure.outcome is not Outcome.STIFF:
             raise
@@ -241,7 +275,7 @@ def _steps(end_rad: float) -> list[float]:
     return [float(a) for a in np.linspace(0.0, end_rad, max(6, int(abs(end_rad) / 0.15)))]
 
 
-def _at_a_stop(wheel: Handwheel, angle_rad: float, sign: float, outcome: Outcome) -> float:
+def at_a_stop(wheel: Handwheel, angle_rad: float, sign: float, outcome: Outcome) -> float:
     """Return the angle of a wheel that stopped turning, with its whole turns corrected if it can only be an end stop.
 
     A wheel that stops at the angle of its end stop, but whole turns before it, was not in the turn that was assumed.

@@ -28,7 +28,8 @@ class Outcome(StrEnum):
 class ObjectState:
     """What an observation says about an object: a named state, a value of its scale, or an angle clockwise from up.
 
-    `sigma` is one standard deviation of the value or angle.
+    `sigma` is one standard deviation of the value or angle. `turned_rad` is the angle, with its whole turns, to which the
+    object was turned before; an observation shows one turn only.
     """
 
     name: str
@@ -36,6 +37,7 @@ class ObjectState:
     value: float | None = None
     angle_rad: float | None = None
     sigma: float = 0.0
+    turned_rad: float | None = None
 
 
 SURE = 2.0  # sigmas added to the error; otherwise an object outside of the tolerance may be read as inside it

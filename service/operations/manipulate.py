@@ -112,7 +112,12 @@ def _operate(
     session: Session, eye: _Eye, panel_object: PanelObject, target: str | float, now: ObjectReading | None
 ) -> SkillReport:
     current = None if now is None else object_state(now, eye.witness)
-    return operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
+    if current is not None:
+        current = replace(current, turned_rad=session.world.turned_rad.get(panel_object.name))
+    report = operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
+    if panel_object.turns_round and report.reached is not None:
+        session.world.note_turned(panel_object.name, report.reached)
+    return report
 
 
 def _look_first(session: Session, eye: _Eye, panel_object: PanelObject) -> tuple[ObjectReading | None, list[str]]:

@@ -92,3 +92,11 @@ def test_the_tolerances_of_the_cell_file_are_three_sigma() -> None:
     assert np.allclose(expected.parent_from_child.translation, workspace.panel_position_m)
     sigma = np.sqrt(np.diag(expected.covariance))
     assert np.allclose(3.0 * sigma, [workspace.position_tolerance_m] * 3 + [workspace.angle_tolerance_rad] * 3)
+
+
+def test_whole_turns_of_a_wheel_are_kept_when_everything_else_is_forgotten() -> None:
+    world = WorldModel()
+    world.note_turned("bypass", -6.0)
+    world.note_readings([reading("a", state="on")])
+    world.forget()
+    assert (dict(world.turned_rad), dict(world.readings)) == ({"bypass": -6.0}, {})

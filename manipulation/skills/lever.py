@@ -1,4 +1,4 @@
-"""Turns a lever valve: encloses the bar between the fingers without squeezing it, and carries it about its hub."""
+"""Turns a lever valve: pushes the side of its bar with the closed fingers, near the end, about its hub."""
 
 from __future__ import annotations
 
@@ -9,40 +9,45 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.motion import Compliance, Guard, Quantity
+from hal.motion import Compliance, Guard, MotionReport, Quantity
 from hal.panel import Lever
-from manipulation.planning.cartesian_path import arc
+from manipulation.planning.cartesian_path import arc, shifted
 from manipulation.skills.attempt import STANDOFF_M, Attempt
-from manipulation.skills.contact import against_turn, centre_between
+from manipulation.skills.contact import FEEL_M_PER_S, FEEL_N, meet
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
 from manipulation.skills.repeat import perform
 
 OVERLAP_M = 0.013  # how far the tips reach below the top of the bar
-FROM_END_M = 0.008  # distance of the fingers from the end of the bar; a long lever arm keeps the load on the pads low
-APPROACH_SIDE_M = 0.010  # free space on each side when approaching; more than the pose error
-CAGE_SIDE_M = 0.002  # free space on each side in the stroke: the bar is enclosed, not squeezed
+FROM_END_M = 0.005  # of the fingers' middle from the end of the bar; the longest lever arm keeps the load low
+BESIDE_M = 0.008  # free space between hand and bar when approaching; more than the pose error
+BEYOND_M = 0.010  # how far beyond the expected side the bar is felt for
+BACK_M = 0.008  # back from the bar before leaving, because the pressed pads rub on it
 STROKE_M_PER_S = 0.08
 LAST_RAD = np.radians(9.0)  # the last part is slow; at full speed the force at the end stop exceeds 300 N
-OVERTRAVEL_RAD = np.radians(12.0)  # play between fingers and bar, and compression of the pads
+OVERTRAVEL_RAD = np.radians(12.0)  # compression of the pads
 LAST_M_PER_S = 0.018
+HEAVY_N, LAST_HEAVY_M_PER_S = 45.0, 0.009  # a heavy bar is brought to its end stop more slowly: less overshoot
 END_RISE_N = 8.0
 # If the tool stops by more than this angle before the state, the cause is friction and not the end stop.
 SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
-EFFORT_SPREAD = 1.6
-EFFORT_FLOOR_N = 35.0
-LARGEST_STOP_N = 92.0  # below the cell's protective limit, to distinguish a stiff valve from a collision
-MOVED_RAD = np.radians(12.0)
+EASY_N = 35.0  # a bar that gives way below this is turned at once; a heavier one is loaded slowly first
+LOAD_M_PER_S = 0.02  # at 80 mm/s the force overshoots by 30 N before the arm has stopped
+LARGEST_N = 90.0  # below the cell's protective limit, to distinguish a stiff valve from a collision
+LARGEST_WITH_FRICTION_N = 96.0
+FELT_RATIO, FELT_N = 1.25, 12.0  # a bar that needs more than this multiple of the felt force plus this much has stalled
+FELT_SAMPLES = 12  # of the log, a tenth of a second
+MOVED_RAD = np.radians(6.0)
 TOLERANCE_RAD = np.radians(8.0)
 INF = float("inf")
 # Stiff across the bar, in the direction of the stroke. Along the bar and the fingers the hand is compliant, because a
-# pose error would build up friction there (25 N of 60) that is released in jumps.
+# pose error would build up friction there. With a mass of 50 kg that friction flips from tick to tick (28 N of 67).
 YIELDING = Compliance(
-    stiffness=(INF, 1000.0, 2000.0, INF, INF, INF),
-    damping=(1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0),
-    mass=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0),
+    stiffness=(1000.0, INF, 2000.0, INF, INF, INF),
+    damping=(4000.0, 4000.0, 4000.0, 10.0, 10.0, 10.0),
+    mass=(400.0, 400.0, 400.0, 1.0, 1.0, 1.0),
     max_offset_m=0.006,
 )
 
@@ -120,70 +125,140 @@ def _is_at(seen: ObjectState, target: str, goal_rad: float) -> bool:
 
 def _turn_lever(attempt: Attempt, valve: Lever, turn: _Turn) -> float:
     """Make one stroke; returns the angle that the bar reached, as measured by the tool."""
-    open_m = valve.width_m + 2.0 * APPROACH_SIDE_M
-    radius = valve.length_m - FROM_END_M
-    ways = [_way(valve, turn, radius, flip) for flip in (0.0, np.pi)]
-    attempt.begin(ways, may_touch=(valve.name,), width_m=open_m, name=valve.name)
+    side_m = valve.width_m / 2 + attempt.context.hand.closed_half_m[1]  # between the middles of bar and hand in contact
+    ways = [_way(valve, turn, side_m + BESIDE_M, flip) for flip in (0.0, np.pi)]
+    attempt.begin(ways, may_touch=(valve.name,), width_m=0.0, name=valve.name)
     down = attempt.advance(STANDOFF_M + OVERLAP_M, name="approach")
     if down.tripped is not None:
-        raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
-    centre_between(attempt, room_m=2.0 * APPROACH_SIDE_M, what="bar")
-    hub = _hub(attempt, valve, turn.start_rad)
-    attempt.open_to(valve.width_m + 2.0 * CAGE_SIDE_M, name="cage")
-    turned = _carry(attempt, valve, turn, hub)
-    attempt.open_to(open_m, name="let go")
-    attempt.leave(STANDOFF_M + OVERLAP_M)
-    return turn.start_rad + turned
+        raise SkillFailure(Outcome.MISSED, "the hand landed on the bar")
+    start = attempt.pose()
+    sign = float(np.sign(turn.span_rad))
+    ahead = sign * attempt.context.panel_pose.rotation.apply(_across(turn.start_rad))
+    goal = RigidTransform.from_components(start.translation + (BESIDE_M + BEYOND_M) * ahead, start.rotation)
+    met = meet(attempt, goal, name="feel", speed_m_per_s=FEEL_M_PER_S, stop_n=FEEL_N)
+    if not met.is_met:
+        raise SkillFailure(Outcome.MISSED, "there is no bar beside the hand")
+    contact_m = start.translation + met.way_m * ahead
+    way = _Arc(
+        hub=_hub(attempt, valve, turn.start_rad, contact_m + side_m * ahead),
+        axis=sign * attempt.context.panel_pose.rotation.apply([0.0, 0.0, -1.0]),  # clockwise seen from the front
+        radius_m=valve.length_m - FROM_END_M,
+        span_rad=abs(turn.span_rad),
+        against=_in_tool(start, -ahead),
+    )
+    try:
+        return turn.start_rad + sign * _carry(attempt, way)
+    except SkillFailure as failure:
+        failure.reached = turn.start_rad + sign * (failure.reached or 0.0)
+        raise
+    finally:
+        back = shifted(attempt.pose(), BACK_M * np.array(way.against))
+        attempt.straight(back, name="step back", speed_m_per_s=STROKE_M_PER_S)
+        attempt.leave(STANDOFF_M + OVERLAP_M)
 
 
-def _way(valve: Lever, turn: _Turn, radius: float, flip: float) -> list[RigidTransform]:
-    """Return grip poses in the panel frame from the standoff to the end, with the closing direction across the bar."""
+def _across(angle_rad: float) -> Array:
+    """Return the direction in the panel (3,) in which the bar at this angle moves when it turns clockwise."""
+    return np.array([np.cos(angle_rad), -np.sin(angle_rad), 0.0])
+
+
+def _way(valve: Lever, turn: _Turn, beside_m: float, flip: float) -> list[RigidTransform]:
+    """Return grip poses in the panel frame from the standoff beside the bar to the end, with the fingers' width across."""
+    sign = float(np.sign(turn.span_rad))
 
     def at(angle: float, z: float) -> RigidTransform:
-        x, y = valve.position_m
-        return panel_from_grip((x + radius * np.sin(angle), y + radius * np.cos(angle), z), flip - angle)
+        along = (valve.length_m - FROM_END_M) * np.array([np.sin(angle), np.cos(angle), 0.0])
+        x, y, _ = np.array(valve.point_m) + along - sign * beside_m * _across(angle)
+        return panel_from_grip((x, y, z), np.pi / 2 - angle + flip)
 
     low = valve.height_m - OVERLAP_M
-    over = OVERTRAVEL_RAD * np.sign(turn.span_rad)
-    steps = np.linspace(turn.start_rad, turn.goal_rad + over, max(8, int(abs(turn.span_rad) / 0.05)))
+    steps = np.linspace(turn.start_rad, turn.goal_rad + sign * OVERTRAVEL_RAD, max(8, int(abs(turn.span_rad) / 0.05)))
     return [at(turn.start_rad, valve.height_m + STANDOFF_M), *(at(float(a), low) for a in steps)]
 
 
-def _hub(attempt: Attempt, valve: Lever, angle_rad: float) -> Array:
-    """Return the hub in the base frame: its place by the panel's pose, corrected across the bar by touch."""
-    panel = attempt.context.panel_pose
-    tool = (panel.inv() * attempt.pose()).translation
-    across = np.array([np.cos(angle_rad), -np.sin(angle_rad), 0.0])
-    offset = (tool - np.array(valve.point_m)) @ across
-    return np.asarray(panel.apply(np.array(valve.point_m) + offset * across + [0.0, 0.0, tool[2]]))
+def _hub(attempt: Attempt, valve: Lever, angle_rad: float, bar_m: Array) -> Array:
+    """Return the hub (3,) in the base frame: its place by the panel's pose, corrected across the bar by touch.
 
-
-def _carry(attempt: Attempt, valve: Lever, turn: _Turn, hub: Array) -> float:
-    """Make the stroke in two parts: fast to 9 degrees before the end, then slowly onto the end stop.
-
-    Returns the signed angle by which the bar turned: the angle of the tool minus the play between fingers and bar and
-    the compression of the pads.
+    Args:
+        bar_m: the middle of the bar where it was touched, in the base frame.
     """
-    context, span_rad = attempt.context, turn.span_rad
-    sign = float(np.sign(span_rad))
-    axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])  # clockwise seen from the front
-    radius = valve.length_m - FROM_END_M
-    stop_n = min(LARGEST_STOP_N, EFFORT_SPREAD * valve.torque_nm / radius + EFFORT_FLOOR_N)
+    panel = attempt.context.panel_pose
+    bar = panel.inv().apply(bar_m)
+    across = _across(angle_rad)
+    offset = (bar - np.array(valve.point_m)) @ across
+    return np.asarray(panel.apply(np.array([*valve.position_m, bar[2]]) + offset * across))
+
+
+def _in_tool(tool: RigidTransform, direction: Array) -> tuple[float, float, float]:
+    x, y, z = tool.rotation.inv().apply(direction)
+    return float(x), float(y), float(z)
+
+
+def _carry(attempt: Attempt, way: _Arc) -> float:
+    """Make the stroke: to 9 degrees before the end as fast as the bar allows, then slowly onto the end stop.
+
+    Returns the angle by which the bar turned: that of the tool minus what the pads yield.
+    """
     start = attempt.pose()
-    against = against_turn(start, hub, sign * axis)
-    strong = Guard(name="effort", quantity=Quantity.FORCE, limit=stop_n, axis=against)
-    fast_rad = max(0.0, abs(span_rad) - LAST_RAD)
-    if fast_rad > 0.0:
-        poses = arc(start, centre_m=hub, axis=axis, angle_rad=sign * fast_rad)
-        report = attempt.along(poses, name="turn", speed_m_per_s=STROKE_M_PER_S, guards=(strong,), compliance=YIELDING)
-        if report.tripped is not None:
-            turned = _between(start, report.base_from_tool)
-            outcome = Outcome.STIFF if turned < MOVED_RAD else Outcome.STALLED
-            raise SkillFailure(
-                outcome, f"it did not give way at {report.peak_force_n:.0f} N", reached=turn.start_rad + sign * turned
-            )
-    way = _Arc(hub=hub, axis=sign * axis, radius_m=radius, span_rad=abs(span_rad), against=against)
-    return sign * _to_the_stop(attempt, way, start, strong)
+    felt_n = _turn_most(attempt, way, start, max(0.0, way.span_rad - LAST_RAD))
+    return _to_the_stop(attempt, way, start, LAST_M_PER_S if felt_n < HEAVY_N else LAST_HEAVY_M_PER_S)
+
+
+def _turn_most(attempt: Attempt, way: _Arc, start: RigidTransform, fast_rad: float) -> float:
+    """Turn the bar by `fast_rad` from where the tool was at `start`; returns the force that it takes.
+
+    A bar that does not give way easily is loaded slowly up to the largest force, which tells what it needs.
+
+    Raises:
+        SkillFailure: `stiff` or `stalled`, with the turn of the bar.
+    """
+    if fast_rad <= 0.0:
+        return 0.0
+    easy = _turn_to(attempt, way, start, fast_rad, limit_n=EASY_N, speed_m_per_s=STROKE_M_PER_S)
+    if easy.tripped is None:
+        return _felt_n(way, easy)
+    give_m = LARGEST_N / attempt.context.hand.pad_stiffness_n_per_m
+    loaded_rad = min(fast_rad, _between(start, easy.base_from_tool) + give_m / way.radius_m)
+    loaded = _turn_to(attempt, way, start, loaded_rad, limit_n=LARGEST_N, speed_m_per_s=LOAD_M_PER_S)
+    if loaded.tripped is not None:
+        raise _gave_no_way(attempt, way, start, loaded)
+    felt_n = _felt_n(way, loaded)
+    limit_n = min(LARGEST_N, FELT_RATIO * felt_n + FELT_N)
+    rest = _turn_to(attempt, way, start, fast_rad, limit_n=limit_n, speed_m_per_s=STROKE_M_PER_S)
+    if rest.tripped is not None:
+        raise _gave_no_way(attempt, way, start, rest)
+    return felt_n
+
+
+def _felt_n(way: _Arc, report: MotionReport) -> float:
+    """Return the force against the turn at the end of a motion, N."""
+    return float(np.median(report.log.wrench[-FELT_SAMPLES:, :3] @ np.array(way.against)))
+
+
+def _efforts(way: _Arc, limit_n: float) -> tuple[Guard, ...]:
+    """Return the guards of a turn: the force against it, and the whole force, to which friction adds."""
+    return (
+        Guard(name="effort", quantity=Quantity.FORCE, limit=limit_n, axis=way.against),
+        Guard(name="effort", quantity=Quantity.FORCE, limit=LARGEST_WITH_FRICTION_N, ticks=4),
+    )
+
+
+def _turn_to(
+    attempt: Attempt, way: _Arc, start: RigidTransform, goal_rad: float, *, limit_n: float, speed_m_per_s: float
+) -> MotionReport:
+    here = attempt.pose()
+    poses = arc(here, centre_m=way.hub, axis=way.axis, angle_rad=max(0.0, goal_rad - _between(start, here)))
+    return attempt.along(
+        poses, name="turn", speed_m_per_s=speed_m_per_s, guards=_efforts(way, limit_n), compliance=YIELDING
+    )
+
+
+def _gave_no_way(attempt: Attempt, way: _Arc, start: RigidTransform, report: MotionReport) -> SkillFailure:
+    force_n = float(report.wrench[:3] @ np.array(way.against))
+    turned = max(0.0, _between(start, report.base_from_tool) - way.lag_rad(attempt, force_n))
+    outcome = Outcome.STIFF if turned < MOVED_RAD else Outcome.STALLED
+    what = f"it did not give way at {report.peak_force_n:.0f} N, {1e3 * way.radius_m:.0f} mm from its hub"
+    return SkillFailure(outcome, what, reached=turned)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -196,8 +271,12 @@ class _Arc:
     span_rad: float
     against: tuple[float, float, float]
 
+    def lag_rad(self, attempt: Attempt, force_n: float) -> float:
+        """Return by how much the tool is ahead of the bar, because the pads yield under a force."""
+        return max(0.0, force_n) / attempt.context.hand.pad_stiffness_n_per_m / self.radius_m
 
-def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, strong: Guard) -> float:
+
+def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, speed_m_per_s: float) -> float:
     """Move on slowly until the force rises where the end stop can be; an earlier rise is the bar's own friction.
 
     Returns the angle by which the bar turned since `start`.
@@ -210,11 +289,11 @@ def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, strong: Gua
         rest_rad = way.span_rad - _between(start, here) + OVERTRAVEL_RAD
         report = attempt.along(
             arc(here, centre_m=way.hub, axis=way.axis, angle_rad=rest_rad),
-            name="turn to the stop", speed_m_per_s=LAST_M_PER_S, guards=(rise, strong), compliance=YIELDING,
+            name="turn to the stop", speed_m_per_s=speed_m_per_s, guards=(rise, *_efforts(way, LARGEST_N)), compliance=YIELDING,
         )  # fmt: skip
         force = float(np.linalg.norm(report.wrench[:3]))
         tool_rad = _between(start, report.base_from_tool)
-        lag_rad = (CAGE_SIDE_M + force / attempt.context.hand.pad_stiffness_n_per_m) / way.radius_m
+        lag_rad = way.lag_rad(attempt, force)
         # The tool is ahead of the bar by a lag that is known poorly, so at the stop it is always past the state.
         if report.tripped != rise.name or tool_rad > way.span_rad - SHORT_RAD or tries == STOP_TRIES:
             return max(0.0, tool_rad - lag_rad)

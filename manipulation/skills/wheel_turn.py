@@ -25,9 +25,10 @@ LARGEST_SIDE_N = 85.0  # below the cell's protective limit
 STOP_RATIO, STOP_NM = 1.4, 0.35  # an end stop is a torque above this multiple of the felt one plus this much
 SLIP_RATIO, SLIP_TICKS = 0.4, 10
 LOG_SAMPLES = 300
+SIDE_SAMPLES = 15  # of the log, an eighth of a second
 INF = float("inf")
-DAMPING = (1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0)
-MASS = (100.0, 100.0, 100.0, 1.0, 1.0, 1.0)
+DAMPING = (4000.0, 4000.0, 4000.0, 10.0, 10.0, 10.0)
+MASS = (400.0, 400.0, 400.0, 1.0, 1.0, 1.0)  # with 100 kg friction flips from tick to tick
 MAX_OFFSET_M = 0.008
 
 
@@ -78,7 +79,7 @@ class WheelTurn:
         while True:
             report = self._turn_on(goal_rad)
             if not self._felt.is_moving:
-                x, y = np.median(report.log.wrench[-50:, :2], axis=0)
+                x, y = np.median(report.log.wrench[-SIDE_SAMPLES:, :2], axis=0)
                 self._side_n = float(x), float(y)
             felt = self._felt = felt_in(self._felt, *self._log(report, start))
             self.moved_rad = felt.moved_rad

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.motion import Guard, MotionReport, Quantity
+from hal.motion import MotionReport
 from manipulation.skills.attempt import Attempt
-from manipulation.skills.lever import CAGE_SIDE_M, STOP_TRIES, _Arc, _to_the_stop
+from manipulation.skills.lever import LAST_M_PER_S, STOP_TRIES, _Arc, _to_the_stop
 
 SPAN_RAD = np.pi / 2
 AXIS = np.array([0.0, 0.0, -1.0])
 RADIUS_M = 0.1
 PUSH = np.array([25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-LAG_DEG = float(np.degrees((CAGE_SIDE_M + 25.0 / 5000.0) / RADIUS_M))  # the bar lags behind the tool by this angle
+LAG_DEG = float(np.degrees(25.0 / 5000.0 / RADIUS_M))  # the bar lags behind the tool by this angle
 START = RigidTransform.from_components([0.1, 0.0, 0.0], Rotation.identity())
-STRONG = Guard(name="effort", quantity=Quantity.FORCE, limit=60.0)
 
 
 class Turned:
@@ -45,7 +44,7 @@ class Turned:
 def carried(ends: list[tuple[float, str | None]]) -> tuple[Turned, float]:
     attempt = Turned(ends)
     way = _Arc(hub=np.zeros(3), axis=AXIS, radius_m=RADIUS_M, span_rad=SPAN_RAD, against=(1.0, 0.0, 0.0))
-    return attempt, _to_the_stop(cast(Attempt, attempt), way, START, STRONG)
+    return attempt, _to_the_stop(cast(Attempt, attempt), way, START, LAST_M_PER_S)
 
 
 @pytest.mark.parametrize("end", [(91.0, "end stop"), (89.5, "end stop"), (102.0, None), (83.0, "effort")])

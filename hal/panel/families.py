@@ -11,6 +11,8 @@ from hal.panel.form import Envelope, Face, Rim
 from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, radius_of
 
+BAR_RATIO = 0.45
+"""Usual width of a knob's bar divided by the knob's radius."""
 LEAST_HEIGHT_M = 0.004
 """Height that is assumed for a flat instrument when collisions with the hand are avoided, in metres."""
 
@@ -39,6 +41,19 @@ class Round(PanelObject):
     def keys_of(cls, taught: Taught) -> dict[str, Any]:
         """Return the key for the radius."""
         return radius_of(taught)
+
+
+class Barred(Round):
+    """A round knob with a bar across it to take hold of."""
+
+    bar_m: Annotated[Positive | None, Field(description="width of the bar; 0.45 of the radius if it is not given")] = (
+        None
+    )
+
+    @property
+    def bar_width_m(self) -> float:
+        """Width of the bar."""
+        return BAR_RATIO * self.radius_m if self.bar_m is None else self.bar_m
 
 
 class Rectangular(PanelObject):

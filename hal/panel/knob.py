@@ -6,14 +6,14 @@ import math
 from typing import Any, ClassVar, Literal
 
 from hal.panel.angles import PointerScale
-from hal.panel.families import Round
+from hal.panel.families import Barred
 from hal.panel.form import Rim, circle
 from hal.panel.goals import NumberGoal
 from hal.panel.parts import Positive
 from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale
 
 
-class Knob(Round):
+class Knob(Barred):
     """Knob without detents: a bar on it to take hold of, with a mark that points at a value of the scale around it."""
 
     kind: Literal["knob"] = "knob"

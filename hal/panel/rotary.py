@@ -6,14 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from hal.panel.families import Round
+from hal.panel.families import Barred
 from hal.panel.form import Rim, circle
 from hal.panel.goals import StateGoal
 from hal.panel.parts import Positive, States
 from hal.panel.questions import PLACES, Question, Taught
 
 
-class Rotary(Round):
+class Rotary(Barred):
     """Selector with detents."""
 
     kind: Literal["rotary"] = "rotary"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.motion import Compliance, Guard, Quantity
+from hal.motion import Compliance, Guard, MotionReport, Quantity
 from hal.panel import Rotary
 from hal.panel.knob import Knob
 from manipulation.planning.cartesian_path import arc
@@ -18,19 +21,26 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.repeat import perform
 
 SIDE_M = 0.009
-BAR_RATIO = 0.45  # width of the bar divided by the knob's radius
 SEAT_N = 5.0
 LIFT_M = 0.0015
-GRIP_N = 12.0  # low, because 40 N doubles the force peaks
+GRIPS_N = (12.0, 18.0, 26.0)  # of the tries; low at first, because 40 N doubles the force peaks
 TURN_M_PER_S = 0.05
 PLAY_RAD = 0.08
+FELT_RATIO = 0.85  # of the largest torque; where it is reached first, the bar gives way
+RESISTS_RATIO, SNAP_RATIO = (
+    0.6,
+    0.35,
+)  # of the largest torque: above the first a detent resists, below the second it was passed
+LEAST_NM = 0.03
 STOP_N = 40.0
 TOLERANCE_RAD = np.radians(12.0)
-# A heavy virtual mass prevents chatter (15 to 28 N from tick to tick with 8 kg, 4 to 6 N with 200 kg).
+INF = float("inf")
+# A heavy virtual mass prevents chatter (15 to 28 N from tick to tick with 8 kg, 4 to 6 N with 200 kg). Along the fingers
+# the hand yields too: stiff, it was pushed against the knob with 41 N.
 YIELDING = Compliance(
-    stiffness=(400.0, 400.0, float("inf"), float("inf"), float("inf"), float("inf")),
-    damping=(1500.0, 1500.0, 1500.0, 10.0, 10.0, 10.0),
-    mass=(200.0, 200.0, 200.0, 1.0, 1.0, 1.0),
+    stiffness=(400.0, 400.0, 400.0, INF, INF, INF),
+    damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0),
+    mass=(200.0, 200.0, 400.0, 1.0, 1.0, 1.0),
     max_offset_m=0.01,
 )
 
@@ -62,9 +72,17 @@ def rotary(
     where = InitialState(
         lambda seen: _resting_angle(seen, angles), what=f"the position of {name}", current=current, verify=verify
     )
+    tries = itertools.count()
+
+    def stroke(attempt: Attempt) -> float:
+        start, goal = where.known, angles[target]
+        grip_n = GRIPS_N[min(next(tries), len(GRIPS_N) - 1)]
+        between = sum(min(start, goal) < angle <= max(start, goal) for angle in angles.values())
+        return turn_bar(attempt, selector, start, goal, over_rad=PLAY_RAD, grip_n=grip_n, detents=between)
+
     return perform(
         context,
-        lambda attempt: turn_bar(attempt, selector, where.known, angles[target], over_rad=PLAY_RAD),
+        stroke,
         skill="rotary",
         object_name=name,
         target=target,
@@ -87,40 +105,102 @@ def _is_at(seen: ObjectState, target: str, angle_rad: float) -> bool:
 
 
 def turn_bar(
-    attempt: Attempt, selector: Rotary | Knob, start_rad: float, goal_rad: float, *, over_rad: float = 0.0
+    attempt: Attempt,
+    selector: Rotary | Knob,
+    start_rad: float,
+    goal_rad: float,
+    *,
+    over_rad: float = 0.0,
+    grip_n: float = GRIPS_N[0],
+    detents: int = 0,
 ) -> float:
-    """Hold the bar of a knob and turn it `over_rad` further than asked; returns the angle reached."""
-    context = attempt.context
-    bar_m = BAR_RATIO * selector.radius_m
+    """Hold the bar of a knob and turn it `over_rad` further than asked; returns the angle reached.
+
+    Args:
+        detents: how many must be felt; the hand then turns further by what the pads were felt to yield.
+
+    Raises:
+        SkillFailure: a finger landed on the bar, there is none between them, it stalled, or fewer detents were felt.
+    """
+    bar_m = selector.bar_width_m
     open_m = bar_m + 2.0 * SIDE_M
     seat = selector.height_m / 2  # the shoulder under the bar
-    ways = [_way(selector, start_rad, goal_rad, seat, flip) for flip in (0.0, np.pi)]
+    _hold(attempt, selector, [_way(selector, start_rad, goal_rad, seat, flip) for flip in (0.0, np.pi)], open_m, grip_n)
+    start = attempt.pose()
+    sign = float(np.sign(goal_rad - start_rad))
+    span_rad = abs(goal_rad - start_rad) + over_rad  # the detent pulls the knob back into place
+    reports = [_turn(attempt, start, sign * span_rad)]
+    felt = _felt(reports, sign)
+    if detents and reports[0].tripped is None:
+        reports.append(_turn(attempt, attempt.pose(), sign * _give_rad(attempt, reports[0], felt, span_rad)))
+        felt = _felt(reports, sign)
+    end = reports[-1]
+    turned = float(np.linalg.norm((end.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
+    attempt.open_to(open_m, name="let go")
+    attempt.leave(STANDOFF_M + selector.height_m - seat)
+    reached = start_rad + sign * turned
+    if end.tripped is not None:
+        raise SkillFailure(Outcome.STALLED, f"it stopped against {end.peak_force_n:.0f} N", reached=reached)
+    passed = detents_passed(felt)
+    if passed < detents:
+        what = f"{passed} of {detents} detents were felt while the hand turned all the way at {grip_n:.0f} N"
+        raise SkillFailure(Outcome.SLIPPED, what, reached=reached)
+    return reached
+
+
+def _hold(
+    attempt: Attempt, selector: Rotary | Knob, ways: list[list[RigidTransform]], open_m: float, grip_n: float
+) -> None:
+    seat = selector.height_m / 2
     attempt.begin(ways, may_touch=(selector.name,), width_m=open_m, name=selector.name)
     down = attempt.advance(
         STANDOFF_M + selector.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N
     )
-    height = float((context.panel_pose.inv() * attempt.pose()).translation[2])
+    height = float((attempt.context.panel_pose.inv() * attempt.pose()).translation[2])
     if down.tripped is not None and height > selector.height_m - 0.002:
         raise SkillFailure(Outcome.MISSED, "a finger landed on the bar")
     if down.tripped is not None:
         attempt.advance(-LIFT_M, name="lift off the shoulder", speed_m_per_s=0.03)
     centre_between(attempt, room_m=2.0 * SIDE_M, what="bar")
-    width = attempt.grasp(GRIP_N, name="hold the bar")
-    if width < 0.5 * bar_m:
+    width = attempt.grasp(grip_n, name="hold the bar")
+    if width < 0.4 * selector.bar_width_m:
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * width:.1f} mm; no bar between them")
-    start = attempt.pose()
-    axis = context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
-    over = over_rad * float(np.sign(goal_rad - start_rad))  # the detent pulls the knob back into place
-    poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=goal_rad - start_rad + over)
+
+
+def _turn(attempt: Attempt, start: RigidTransform, angle_rad: float) -> MotionReport:
+    axis = attempt.context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
+    poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=angle_rad)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=STOP_N)
-    report = attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=YIELDING)
-    turned = float(np.linalg.norm((report.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
-    attempt.open_to(open_m, name="let go")
-    attempt.leave(STANDOFF_M + selector.height_m - seat)
-    reached = start_rad + float(np.sign(goal_rad - start_rad)) * turned
-    if report.tripped is not None:
-        raise SkillFailure(Outcome.STALLED, f"it stopped against {report.peak_force_n:.0f} N", reached=reached)
-    return reached
+    return attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=YIELDING)
+
+
+def _felt(reports: list[MotionReport], sign: float) -> Array:
+    """Return the torques (N,) against the turn."""
+    return np.concatenate([-sign * report.log.wrench[:, 5] for report in reports])
+
+
+def _give_rad(attempt: Attempt, report: MotionReport, torque_nm: Array, span_rad: float) -> float:
+    """Return by what turn of the hand the pads yield before the bar follows: up to where the torque is nearly largest."""
+    most = float(np.percentile(torque_nm, 98.0))
+    if most < LEAST_NM:
+        return 0.0
+    k = int(np.argmax(torque_nm >= FELT_RATIO * most))
+    context = attempt.context
+    first, then = (context.kinematics.tool(q, context.flange_from_grip) for q in report.log.positions_rad[[0, k]])
+    turned = float(np.linalg.norm((then.rotation * first.rotation.inv()).as_rotvec()))
+    return min(turned, 0.5 * span_rad)
+
+
+def detents_passed(torque_nm: Array) -> int:
+    """Return how many detents were passed: the torque resists up to the middle between two, then it falls."""
+    most = max(2.0 * LEAST_NM, float(np.percentile(torque_nm, 98.0)))
+    count, resists = 0, False
+    for torque in torque_nm:
+        if torque > RESISTS_RATIO * most:
+            resists = True
+        elif resists and torque < SNAP_RATIO * most:
+            count, resists = count + 1, False
+    return count
 
 
 def _way(

@@ -25,7 +25,7 @@ class KnobBody(Body[Knob]):
     def model(self, panel_object: Knob, start: Start) -> ObjectModel:
         """Return knob, bar and mark."""
         low, high = sorted((panel_object.scale.at_min, panel_object.scale.at_max))
-        parts = knob_with_bar(panel_object.radius_m, panel_object.height_m)
+        parts = knob_with_bar(panel_object.radius_m, panel_object.height_m, panel_object.bar_width_m)
         limits = (low - 0.05, high + 0.05)
         urdf = moving(parts, kind="revolute", axis=(0, 0, -1), limits=limits, mass_kg=0.05, inertia_kg_m2=1e-4)
         return ObjectModel(urdf=urdf, place=start.place)

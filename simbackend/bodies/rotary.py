@@ -24,7 +24,7 @@ class RotaryBody(Body[Rotary]):
         """Return knob, bar and mark."""
         angles = [state.angle_rad for state in panel_object.states]
         limits = (min(angles) - 0.1, max(angles) + 0.1)
-        parts = knob_with_bar(panel_object.radius_m, panel_object.height_m)
+        parts = knob_with_bar(panel_object.radius_m, panel_object.height_m, panel_object.bar_width_m)
         urdf = moving(parts, kind="revolute", axis=(0, 0, -1), limits=limits, mass_kg=0.05, inertia_kg_m2=1e-4)
         return ObjectModel(urdf=urdf, place=start.place)
 
@@ -46,12 +46,12 @@ class RotaryBody(Body[Rotary]):
         return ObjectTruth(name=panel_object.name, state=nearest_state(panel_object.states, place), value=place)
 
 
-def knob_with_bar(radius_m: float, height_m: float) -> list[list[str]]:
+def knob_with_bar(radius_m: float, height_m: float, bar_m: float) -> list[list[str]]:
     """Return a round shoulder, a bar across it to grip, and a white mark on the bar's end."""
     r, h = radius_m, height_m
     return [
         shape(at(0, 0, h / 4), cylinder(r, h / 2), KNOB),
-        shape(at(0, 0, 0.75 * h), box((0.45 * r, 2 * r, h / 2)), KNOB),
+        shape(at(0, 0, 0.75 * h), box((bar_m, 2 * r, h / 2)), KNOB),
         shape(at(0, 0.6 * r, h), box((0.12 * r, 0.75 * r, 0.0006)), WHITE, collision=False),
     ]
 

@@ -44,7 +44,7 @@ def reached(arm: Kinematics, found: Array, pose: Array) -> float:
 def missing(arm: Kinematics, q: Array, rng: np.random.Generator) -> int:
     """Return how many branches within the limits a search from random starts finds that the inverse lacks."""
     pose = arm.flange(q).as_matrix()
-    known = arm._branches(pose)
+    known = arm._branches(pose, np.empty(0))
     starts = rng.uniform(arm.lower_rad, arm.upper_rad, (STARTS, len(q)))
     lost = 0
     for start in starts:

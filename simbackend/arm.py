@@ -28,7 +28,7 @@ MOVING_RAD_PER_S = 0.002
 class ArmOptions(SimOptions):
     """`model`: which arm. `lookahead_s`: of its drives, for an arm behind a wire (see `ArmDrive`)."""
 
-    model: Annotated[Literal["t3", "ur10e"], Field(description="arm that is simulated")] = "t3"
+    model: Annotated[Literal["t3", "ur10e", "panda"], Field(description="arm that is simulated")] = "t3"
     lookahead_s: Annotated[
         float,
         Field(
@@ -74,7 +74,7 @@ class SimArm(SimDevice[JointState]):
         wanted = np.asarray(position_rad, float)
         if wanted.shape != self._lower.shape or not math.isfinite(wanted @ wanted):
             raise InvalidRequest(
-                f"{self._name}: a set-point must be six finite joint angles",
+                f"{self._name}: a set-point must be {len(self._lower)} finite joint angles",
                 hint="check the planner that sent it",
                 device=self._name,
             )

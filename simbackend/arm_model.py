@@ -1,4 +1,4 @@
-"""The two simulated arms as Denavit-Hartenberg tables, and the URDF generated from them for PyBullet."""
+"""The simulated arms as Denavit-Hartenberg tables, and the URDF generated from them for PyBullet."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.devices import ArmCapabilities, DhLink
 from simbackend.tool_model import tool_urdf
 from simbackend.urdf import Colour, along, cylinder, inertial, joint, link, shape, sphere
-
-DOF = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,7 +74,37 @@ def ur10e() -> ArmModel:
     )
 
 
-MODELS = {"t3": t3, "ur10e": ur10e}
+def panda() -> ArmModel:
+    """Return an arm similar to a Franka Panda: seven joints by its published DH table, with rounded masses and radii.
+
+    The table is converted from the modified to the standard convention. The motors are stronger than the real arm's.
+    """
+    quarter = math.pi / 2.0
+    links = (
+        DhLink(d_m=0.333, a_m=0.0, alpha_rad=-quarter),
+        DhLink(d_m=0.0, a_m=0.0, alpha_rad=quarter),
+        DhLink(d_m=0.316, a_m=0.0825, alpha_rad=quarter),
+        DhLink(d_m=0.0, a_m=-0.0825, alpha_rad=-quarter),
+        DhLink(d_m=0.384, a_m=0.0, alpha_rad=quarter),
+        DhLink(d_m=0.0, a_m=0.088, alpha_rad=quarter),
+        DhLink(d_m=0.107, a_m=0.0, alpha_rad=0.0),
+    )
+    wide, last = (-2.8973, 2.8973), (-0.0175, 3.7525)
+    return ArmModel(
+        capabilities=_capabilities(
+            "panda",
+            links,
+            [wide, (-1.7628, 1.7628), wide, (-3.0718, -0.0698), wide, last, wide],
+            velocity=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
+            acceleration=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
+            radius=(0.08, 0.07, 0.065, 0.065, 0.055, 0.05, 0.045),
+        ),
+        mass_kg=(5.0, 3.0, 3.5, 2.5, 3.0, 1.5, 0.7),
+        torque_nm=(400.0, 400.0, 250.0, 250.0, 80.0, 80.0, 80.0),
+    )
+
+
+MODELS = {"t3": t3, "ur10e": ur10e, "panda": panda}
 
 
 def _capabilities(
@@ -86,6 +114,7 @@ def _capabilities(
     *,
     velocity: tuple[float, ...],
     radius: tuple[float, ...],
+    acceleration: tuple[float, ...] = (8.0, 8.0, 8.0, 20.0, 20.0, 20.0),
 ) -> ArmCapabilities:
     return ArmCapabilities(
         model=model,
@@ -93,7 +122,7 @@ def _capabilities(
         lower_rad=tuple(low for low, _ in limits_rad),
         upper_rad=tuple(high for _, high in limits_rad),
         velocity_rad_per_s=velocity,
-        acceleration_rad_per_s2=(8.0, 8.0, 8.0, 20.0, 20.0, 20.0),
+        acceleration_rad_per_s2=acceleration,
         tip_speed_m_per_s=1.0,
         command_rate_hz=500.0,
         link_radius_m=radius,
@@ -121,7 +150,7 @@ def arm_urdf(
     """Return the URDF of arm, force/torque sensor and gripper, built from primitives.
 
     Link i turns about z at the end of link i - 1: its frame is DH frame i - 1 turned by q_i. The flange is fixed to
-    link 6.
+    the last link.
     """
     caps = model.capabilities
     lines = ['<robot name="arm">', *link("base", inertial(10.0, (0, 0, 0), (1.0, 1.0, 1.0)))]

@@ -23,7 +23,6 @@ from simbackend.draws import Draws
 from simbackend.events import NearTriggers, schedule
 from simbackend.link import WorldLink
 from simbackend.wire import (
-    DOF,
     GRIPPER_AT,
     JOINTS_AT,
     LIGHTS_AT,
@@ -293,11 +292,12 @@ def _check_park(cell: Cell) -> None:
     """Check the park position, because the arm starts there."""
     limits = MODELS[_arm_model(cell)]().capabilities
     park = cell.file.workspace.park_rad
-    if len(park) == DOF and all(a < q < b for a, q, b in zip(limits.lower_rad, park, limits.upper_rad, strict=True)):
+    joints = len(limits.links)
+    if len(park) == joints and all(a < q < b for a, q, b in zip(limits.lower_rad, park, limits.upper_rad, strict=True)):
         return
     raise ConfigError(
         f"the arm {limits.model!r} cannot reach workspace.park_rad = {list(park)}",
-        hint=f"give {DOF} joint angles within {list(limits.lower_rad)} and {list(limits.upper_rad)} rad",
+        hint=f"give {joints} joint angles within {list(limits.lower_rad)} and {list(limits.upper_rad)} rad",
         key="workspace.park_rad",
     )
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.config import Cell
 
-DOF = 6
+MOST_JOINTS = 7  # room in the vectors; an arm with fewer leaves the rest at 0
 LIGHTS = 4
 MAX_PROXIMITY = 4
 DOUBLE = 8  # bytes
@@ -41,9 +41,9 @@ class DriveCommand(IntEnum):
     SETPOINT = 4
 
 
-# Request vector of a step: op, ticks, drive, 6 joints, gripper flag, width, force, speed, lights flag, 4 lights.
+# Request vector of a step: op, ticks, drive, 7 joints, gripper flag, width, force, speed, lights flag, 4 lights.
 REQUEST = 24  # doubles; all requests have this length without framing, so a step costs one write and one read
-JOINTS_AT, GRIPPER_AT, LIGHTS_AT = 3, 9, 13
+JOINTS_AT, GRIPPER_AT, LIGHTS_AT = 3, 10, 14
 # Request vector of an image: op, width, height, near, fx, fy, cx, cy, kind, then flange_from_camera row by row (3 x 4).
 CAMERA_AT = 9
 
@@ -83,62 +83,67 @@ class Snapshot:
         return self.vector[3:6]
 
     @property
+    def joints(self) -> int:
+        """Return the number of the arm's joints, n."""
+        return int(self.vector[9])
+
+    @property
     def position_rad(self) -> Array:
-        """Return the (6,) joint positions."""
-        return self.vector[10:16]
+        """Return the (n,) joint positions."""
+        return self.vector[10 : 10 + self.joints]
 
     @property
     def velocity_rad_per_s(self) -> Array:
-        """Return the (6,) joint speeds."""
-        return self.vector[16:22]
+        """Return the (n,) joint speeds."""
+        return self.vector[17 : 17 + self.joints]
 
     @property
     def setpoint_rad(self) -> Array:
-        """Return the (6,) set-points of the drives."""
-        return self.vector[22:28]
+        """Return the (n,) set-points of the drives."""
+        return self.vector[24 : 24 + self.joints]
 
     @property
     def wrench(self) -> Array:
         """Return the (6,) wrench of the world on the tool in sensor axes, including the weight, N and N m."""
-        return self.vector[28:34]
+        return self.vector[31:37]
 
     @property
     def pad_force_n(self) -> Array:
         """Return the (2,) contact forces on the left and the right finger."""
-        return self.vector[34:36]
+        return self.vector[37:39]
 
     @property
     def width_m(self) -> float:
         """Return the opening between the pads."""
-        return float(self.vector[36])
+        return float(self.vector[39])
 
     @property
     def is_gripper_moving(self) -> bool:
         """Return whether the gripper is moving."""
-        return bool(self.vector[37])
+        return bool(self.vector[40])
 
     @property
     def is_holding(self) -> bool:
         """Return whether the gripper has stopped at its set force."""
-        return bool(self.vector[38])
+        return bool(self.vector[41])
 
     @property
     def lights_on(self) -> Array:
         """Return the (4,) border lights, 1.0 when on."""
-        return self.vector[40:44]
+        return self.vector[43:47]
 
     @property
     def distance_m(self) -> Array:
         """Return (4,) proximity distances in the order of `WorldConfig.proximity`; NaN when nothing is in range."""
-        return self.vector[44:48]
+        return self.vector[47:51]
 
     @property
     def distance_tick(self) -> int:
         """Return the tick at which the distances were measured."""
-        return int(self.vector[48])
+        return int(self.vector[51])
 
 
-SNAPSHOT = 49
+SNAPSHOT = 52
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

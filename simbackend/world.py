@@ -23,12 +23,12 @@ from simbackend.drive import ArmDrive, GripperDrive
 from simbackend.panel_world import ARM_GROUP, PANEL_GROUP, PanelWorld
 from simbackend.tool_model import PAD_DAMPING_N_S_PER_M, PAD_STIFFNESS_N_PER_M
 from simbackend.wire import (
-    DOF,
     GRIPPER_AT,
     JOINTS_AT,
     LIGHTS,
     LIGHTS_AT,
     MAX_PROXIMITY,
+    MOST_JOINTS,
     PROXIMITY_TICKS,
     DriveCommand,
     WorldConfig,
@@ -36,7 +36,7 @@ from simbackend.wire import (
 
 GRAVITY_M_PER_S2 = 9.81
 TIP_TICKS = 4  # how often to check which mechanisms are near; the tip moves up to 8 mm meanwhile
-UNUSED_4 = (0.0,) * 4  # values of the snapshot that are always zero
+UNUSED_3 = (0.0,) * 3  # values of the snapshot that are always zero
 FINGER_FORCE_N = 250.0  # of the motors, far above the gripper's: its own model limits the grip force
 ARM_GAIN, FINGER_GAIN = 0.45, 0.6  # fraction of a joint's error that its motor corrects in one tick
 CONE_RAYS = 4
@@ -93,7 +93,7 @@ class World:
         # Without the flag the engine computes inertia from the shapes, and a light bat jumps through its stop.
         self.arm = engine.loadURDF(str(path), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE)
         index = {engine.getJointInfo(self.arm, i)[1].decode(): i for i in range(engine.getNumJoints(self.arm))}
-        self.joints = [index[f"link{i + 1}"] for i in range(DOF)]
+        self.joints = [index[f"link{i + 1}"] for i in range(len(self.model.capabilities.links))]
         self.fingers = [index["finger_left"], index["finger_right"]]
         self.moving = [*self.joints, *self.fingers]
         self.sensor, self.flange_link = index["sensor"], index["flange"]
@@ -118,9 +118,9 @@ class World:
         for joint, place in zip(self.moving, places, strict=True):
             engine.resetJointState(self.arm, joint, place)
         self._forces = [*self.model.torque_nm, FINGER_FORCE_N, FINGER_FORCE_N]
-        self._gains = [ARM_GAIN] * DOF + [FINGER_GAIN] * 2
-        self._damps = [1.0] * (DOF + 2)
-        self._zeros = [0.0] * (DOF + 2)
+        self._gains = [ARM_GAIN] * len(self.joints) + [FINGER_GAIN] * 2
+        self._damps = [1.0] * len(self.moving)
+        self._zeros = [0.0] * len(self.moving)
 
     def _true_mount(self, device: str) -> RigidTransform:
         section = self.cell.file.devices.get(device)
@@ -168,9 +168,9 @@ class World:
         if orders & DriveCommand.STOP:
             self.drive.stop()
         if orders & DriveCommand.ENABLE:
-            self.drive.enable(self.q[:DOF])
+            self.drive.enable(self.q[: len(self.joints)])
         if orders & DriveCommand.SETPOINT:
-            self.drive.aim(request[JOINTS_AT : JOINTS_AT + DOF])
+            self.drive.aim(request[JOINTS_AT : JOINTS_AT + len(self.joints)])
         if request[GRIPPER_AT]:
             self.gripper.aim(*(float(x) for x in request[GRIPPER_AT + 1 : GRIPPER_AT + 4]))
         if request[LIGHTS_AT]:
@@ -229,16 +229,21 @@ class World:
 
     def snapshot(self) -> Array:
         """Return the vector whose parts `Snapshot` names."""
+        joints = len(self.joints)
+        spare = [0.0] * (MOST_JOINTS - joints)
         reaction = [-x for x in self.reaction]  # the world on the tool, not the sensor
         return np.array(
             [
-                *(self.tick, self.tick * self.dt_s, self.drive.is_enabled, *self.tip_m, *UNUSED_4),
-                *self.q[:DOF],
-                *self.v[:DOF],
+                *(self.tick, self.tick * self.dt_s, self.drive.is_enabled, *self.tip_m, *UNUSED_3, joints),
+                *self.q[:joints],
+                *spare,
+                *self.v[:joints],
+                *spare,
                 *self.drive.setpoint.tolist(),
+                *spare,
                 *reaction,
                 *self.pad_force_n,
-                *(self.q[DOF] + self.q[DOF + 1], self.gripper.is_moving, self.gripper.is_holding, 0.0),
+                *(self.q[joints] + self.q[joints + 1], self.gripper.is_moving, self.gripper.is_holding, 0.0),
                 *self.panel.lights_on,
                 *[0.0] * (LIGHTS - len(self.panel.lights_on)),
                 *self._proximity,
@@ -247,7 +252,7 @@ class World:
 
     def flange(self) -> RigidTransform:
         """Return the true base_from_flange."""
-        return base_from_flange(self.model.capabilities.links, np.asarray(self.q[:DOF]))
+        return base_from_flange(self.model.capabilities.links, np.asarray(self.q[: len(self.joints)]))
 
     def _measure_distances(self) -> None:
         """Measure the nearest surface in a narrow cone along each sensor's z, averaged over the rays that hit it."""

@@ -90,15 +90,22 @@ class Kinematics:
 
         Source: Elsner et al., EAIK, 2025 (subproblem decomposition); each solution is checked by forward kinematics.
         """
-        found: Array = branches.all_turns(self._branches(base_from_flange.as_matrix()), self.lower_rad, self.upper_rad)
+        solved = self._branches(base_from_flange.as_matrix(), self._free_joint())
+        found: Array = branches.all_turns(solved, self.lower_rad, self.upper_rad)
         return found
 
-    def _branches(self, goal: Array) -> Array:
+    def _free_joint(self, *values: float) -> Array:
+        """Return the values of the free joint to try: samples of its range, and those given."""
+        if len(self.dh) == SOLVED_JOINTS:
+            return np.empty(0)
+        return np.concatenate([np.linspace(self.lower_rad[-1], self.upper_rad[-1], FREE_JOINT_SAMPLES), values])
+
+    def _branches(self, goal: Array, free_rad: Array) -> Array:
         """Return the joint vectors (k, n) that reach the pose (4, 4), each joint up to whole turns."""
         if len(self.dh) == SOLVED_JOINTS:
             return self._solved(goal)
         some = []
-        for free in np.linspace(self.lower_rad[-1], self.upper_rad[-1], FREE_JOINT_SAMPLES):
+        for free in free_rad:
             turn_back = np.linalg.inv(kernels.frames(self.dh[SOLVED_JOINTS:], np.array([free]))[-1])
             six = self._solved(goal @ turn_back)
             some.append(np.column_stack([six, np.full(len(six), free)]))
@@ -146,7 +153,7 @@ class Kinematics:
 
     def _starts(self, pose: Array, near_rad: Array) -> Array:
         """Return the branches (k, n) of a stroke's first pose that can be inside the limits, nearest first."""
-        found = self._branches(pose)
+        found = self._branches(pose, self._free_joint(near_rad[-1]))
         found = found[[bool(_fits(q[None], self.lower_rad, self.upper_rad)[0]) for q in found]]
         if len(found) <= MOST_STARTS:
             return found

@@ -59,10 +59,12 @@ def test_the_nominal_tool_load_balances_the_model() -> None:
     assert record.centre_of_mass_m[2] == pytest.approx(moment / record.mass_kg, abs=2e-4)
 
 
-def test_the_ur10e_cell_comes_up_and_sees_its_panel() -> None:
-    with sim_cell(ROOT / "cells" / "ur10e.toml", seed=2) as cell:
+@pytest.mark.parametrize(("name", "joints"), [("ur10e", 6), ("panda", 7)])
+def test_a_cell_with_another_arm_comes_up_and_sees_its_panel(name: str, joints: int) -> None:
+    with sim_cell(ROOT / "cells" / f"{name}.toml", seed=2) as cell:
         arm = cell.connect("arm")
-        assert arm.capabilities().model == "ur10e"
+        assert arm.capabilities().model == name
+        assert arm.read_state(deadline=cell.deadline()).value.position_rad.shape == (joints,)
         arm.enable(deadline=cell.deadline())
         start = arm.read_state(deadline=cell.deadline()).value.position_rad
         cell.clock.sleep(0.5)

@@ -25,6 +25,7 @@ def warm_up() -> None:
     watched, pairs = np.ones((7, 1), bool), np.array([[0, 3]])
     clearance.least_clearance(dh, q, tool_ends, radii, *box, watched, pairs, 0.01)
     clearance.first_hit(dh, q, q + 0.1, 0.05, tool_ends, radii, *box, watched, pairs, 0.01)
+    clearance.all_clear(dh, q[None], tool_ends, radii, *box, watched, pairs, 0.01)
     clearance.overlap_counts(dh, q[None], tool_ends, radii, pairs)
     ends = clearance.capsule_ends(dh, q, tool_ends)
     clearance.segment_box(ends[0, 0], ends[0, 1], box[0][0], box[1][0], box[2][0])

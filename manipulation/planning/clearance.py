@@ -52,6 +52,23 @@ def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: 
     return best
 
 
+@inlined
+def outside_of_box(middle: Array, half_span: Array, rotation: Array, half: Array) -> float:
+    """Return a lower bound of the distance of a segment from a box: that of the box around it in the box's axes.
+
+    `middle` and `half_span` (3,) of the segment are given from the middle of the box, in the axes of the base.
+    """
+    total = 0.0
+    for k in range(3):
+        place, reach = 0.0, 0.0
+        for m in range(3):
+            place += rotation[m, k] * middle[m]
+            reach += rotation[m, k] * half_span[m]
+        gap = max(0.0, abs(place) - abs(reach) - half[k])
+        total += gap * gap
+    return float(np.sqrt(total)) if total > 0.0 else -1e9
+
+
 @compiled
 def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
     """Return the least distance between two segments.
@@ -124,12 +141,16 @@ def least_clearance(
     for i in range(ends.shape[0]):
         for j in range(halves.shape[0]):
             if watched[i, j]:
-                # The bounding sphere of the box rules out most pairs before the search.
+                # The bounding sphere of the box, then the box around the segment, rule out most pairs.
                 reach = np.sqrt(np.dot(halves[j], halves[j]))
                 centre = 0.5 * (ends[i, 0] + ends[i, 1])
                 span = ends[i, 1] - ends[i, 0]
                 apart = centre - middles[j]
                 bound = np.sqrt(np.dot(apart, apart)) - reach - 0.5 * np.sqrt(np.dot(span, span)) - radii[i]
+                if bound >= min(least, enough):
+                    least = min(least, bound)
+                    continue
+                bound = outside_of_box(centre - middles[j], 0.5 * span, rotations[j], halves[j]) - radii[i]
                 if bound >= min(least, enough):
                     least = min(least, bound)
                     continue
@@ -163,15 +184,57 @@ def first_hit(
 ) -> float:
     """Return the free fraction of the straight joint segment, 1 when all of it is free.
 
-    It is checked every `step_rad` of the fastest joint.
+    It is checked every `step_rad` of the fastest joint. Steps are left out where the last gap shows that they are free,
+    because no point of the arm moves further than each joint's turn times its distance to the furthest point behind it.
     """
     longest = np.max(np.abs(end - start))
     count = max(1, int(np.ceil(longest / step_rad)))
-    for k in range(1, count + 1):
+    way = largest_way(dh, (end - start) / count, tool_ends, radii)
+    k = 1
+    while k <= count:
         q = start + (k / count) * (end - start)
-        if least_clearance(dh, q, tool_ends, radii, rotations, middles, halves, watched, pairs, margin) < margin:
+        gap = least_clearance(dh, q, tool_ends, radii, rotations, middles, halves, watched, pairs, np.inf)
+        if gap < margin:
             return (k - 1) / count
+        k += 1 + int(min((gap - margin) / max(way, 1e-12), 1.0 * count))
     return 1.0
+
+
+@inlined
+def largest_way(dh: Array, turns: Array, tool_ends: Array, radii: Array) -> float:
+    """Return a bound of the way of any point of arm and tool for turns (n,) of the joints."""
+    beyond, thickest = 0.0, 0.0
+    for i in range(tool_ends.shape[0]):
+        for side in range(2):
+            beyond = max(beyond, np.sqrt(np.dot(tool_ends[i, side], tool_ends[i, side])))
+    for i in range(radii.shape[0]):
+        thickest = max(thickest, radii[i])
+    total = 0.0
+    for i in range(dh.shape[0] - 1, -1, -1):
+        beyond += np.sqrt(dh[i, 0] * dh[i, 0] + dh[i, 1] * dh[i, 1])
+        total += abs(turns[i]) * (beyond + thickest)
+    return float(total)
+
+
+@compiled
+def all_clear(
+    dh: Array,
+    samples: Array,
+    tool_ends: Array,
+    radii: Array,
+    rotations: Array,
+    middles: Array,
+    halves: Array,
+    watched: Mask,
+    pairs: Index,
+    margin: float,
+) -> bool:
+    """Return whether the gaps at all configurations (m, n) are at least the margin."""
+    for row in range(samples.shape[0]):
+        gap = least_clearance(dh, samples[row], tool_ends, radii, rotations, middles, halves, watched, pairs, margin)
+        if gap < margin:
+            return False
+    return True
 
 
 @compiled

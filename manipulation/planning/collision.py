@@ -104,6 +104,15 @@ class CollisionModel:
         """Return whether every watched gap is at least the margin."""
         return self.clearance_m(q_rad, enough_m=margin_m) >= margin_m
 
+    def are_clear(self, samples_rad: Array, *, margin_m: float) -> bool:
+        """Return whether every watched gap is at least the margin at all of the joint vectors (m, n)."""
+        return bool(
+            clearance.all_clear(
+                self.kinematics.dh, np.ascontiguousarray(samples_rad), self.tool_ends, self.radii, self.rotations,
+                self.middles, self.halves, self.watched, self.self_pairs, margin_m,
+            )
+        )  # fmt: skip
+
     def free_fraction(
         self, start_rad: Array, end_rad: Array, *, margin_m: float, step_rad: float = RECHECK_RAD
     ) -> float:

@@ -18,6 +18,9 @@ Free = Callable[[Array, Array], float]
 """`free(start, end)`: fraction of the straight segment that is free."""
 
 
+WORTH = 0.99  # a shortcut that saves less is not checked
+
+
 class _Tree:
     """Configurations and their parents, in growing arrays."""
 
@@ -118,9 +121,14 @@ def shortcut(path: Array, *, free: Free, seed: int, rounds: int = 80) -> Array:
             continue
         a = points[i] + rng.random() * (points[i + 1] - points[i])
         b = points[j] + rng.random() * (points[j + 1] - points[j])
-        if free(a, b) == 1.0:
+        round_about = _length([a, *points[i + 1 : j + 1], b])
+        if np.linalg.norm(b - a) < WORTH * round_about and free(a, b) == 1.0:
             points = [*points[: i + 1], a, b, *points[j + 1 :]]
     return _without_repeats(np.array(points))
+
+
+def _length(points: list[Array]) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def _without_repeats(path: Array) -> Array:

@@ -112,14 +112,11 @@ class TransferPlanner:
             most = float(smooth.reaches_rad[index])
             for reach in most * REACHES:
                 smooth = smooth.with_reach(index, reach)
-                if self._is_free(smooth.corner(index, RECHECK_RAD), 0.5 * margin):
+                if self.model.are_clear(smooth.corner(index, RECHECK_RAD), margin_m=0.5 * margin):
                     break
             else:
                 return None
         return smooth
-
-    def _is_free(self, samples: Array, margin: float) -> bool:
-        return all(self.model.is_clear(q, margin_m=margin) for q in samples)
 
     def _timed(self, path: SmoothPath, name: str, guards: tuple[Guard, ...]) -> JointTrajectory:
         return timed(

@@ -105,6 +105,29 @@ def test_the_same_seed_gives_the_same_path() -> None:
     assert np.array_equal(first.times_s, second.times_s)
 
 
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=25, deadline=None)
+def test_steps_are_left_out_only_where_every_one_of_them_is_free(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    boxes = [
+        CollisionBox(
+            name=f"box{k}",
+            parent_from_box=transform_rpy(rng.uniform([-0.8, -0.8, -0.3], [0.8, 0.8, 1.3]), rng.uniform(-1.5, 1.5, 3)),
+            half_m=tuple(rng.uniform(0.01, 0.15, 3)),
+        )
+        for k in range(4)
+    ]
+    model = CollisionModel.build(KINEMATICS, TOOL, boxes)
+    a, b = rng.uniform(-1.5, 1.5, (2, 6))
+    count = int(np.ceil(np.max(np.abs(b - a)) / 0.02))
+    expected = 1.0
+    for k in range(1, count + 1):
+        if not model.is_clear(a + (k / count) * (b - a), margin_m=0.008):
+            expected = (k - 1) / count
+            break
+    assert model.free_fraction(a, b, margin_m=0.008, step_rad=0.02) == expected
+
+
 def test_a_goal_inside_an_obstacle_is_unreachable_and_named() -> None:
     start, goal, _ = _obstacle()
     box = CollisionBox(

@@ -169,10 +169,10 @@ def main() -> None:
     rows = [planned(leg) for leg in chosen]
     print(table(rows), flush=True)
     if options.peers:
-        from benchmarks import transfers_peers
+        from benchmarks.transfers_peers import against_ompl, against_toppra
 
-        print(transfers_peers.against_toppra(rows), flush=True)
-        print(transfers_peers.against_ompl(rows[:: options.of], options.peers), flush=True)
+        print(against_toppra(rows), flush=True)
+        print(against_ompl(rows[:: options.of], options.peers), flush=True)
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import JournalError
-from service.tasks.journal_parts import INSERT_ROW, SCHEMA, parts_of, snapshot, write_part
-from service.tasks.journal_reader import DROPPED, FIRST_HASH, Record, chain_hash, read_records, verify_chain
+from service.tasks.journal_parts import HEAD_SCHEMA, INSERT_ROW, SCHEMA, key_of, parts_of, snapshot, write_part
+from service.tasks.journal_reader import DROPPED, FIRST_HASH, Record, chain_hash, read_records, seal, verify_chain
 
 MAX_GROUP = 200
 MAX_KEPT = 1000  # notes kept in memory while the disk is full
@@ -118,7 +118,8 @@ class Journal:
 
     def _write(self, ready: Future[None]) -> None:
         try:
-            db = _opened(self.path)
+            key = key_of(self.path)
+            db = _opened(self.path, key)
         except (sqlite3.Error, OSError) as error:
             ready.set_exception(_error(self.path, error))
             return
@@ -126,18 +127,18 @@ class Journal:
         is_last, kept = False, list[_Entry]()
         while not is_last:
             group, is_last = self._next_group()
-            kept = _commit(db, self.path, [*kept, *group])
-            self._hand_over(db)
+            kept = _commit(db, self.path, [*kept, *group], key)
+            self._hand_over(db, key)
         db.close()
 
-    def _hand_over(self, db: sqlite3.Connection) -> None:
+    def _hand_over(self, db: sqlite3.Connection, key: bytes) -> None:
         """Move rows to an older part when the live file is too large; a failure loses no row and is tried again later."""
         size = _size_bytes(db)
         if size <= self._hand_over_at:
             return
         self._hand_over_at = self._part_bytes
         try:
-            hand_over(db, self.path, part_bytes=self._part_bytes, keep_parts=self._keep_parts)
+            hand_over(db, self.path, key, part_bytes=self._part_bytes, keep_parts=self._keep_parts)
         except (sqlite3.Error, OSError) as error:
             with contextlib.suppress(sqlite3.Error):
                 db.execute("ROLLBACK")
@@ -159,14 +160,25 @@ class Journal:
         return group, True
 
 
-def _opened(path: Path) -> sqlite3.Connection:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _opened(path: Path, key: bytes) -> sqlite3.Connection:
     db = sqlite3.connect(path, isolation_level=None)
     db.execute("PRAGMA journal_mode=WAL")
     db.execute("PRAGMA synchronous=FULL")  # NORMAL may lose the newest commits in a power cut
     db.execute("PRAGMA journal_size_limit=4000000")  # the WAL is cut back after a large group
     db.execute(SCHEMA)
+    is_sealed = db.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'head'").fetchone()[0]
+    if not is_sealed:  # new, or of a version that had no seal
+        db.execute("BEGIN IMMEDIATE")
+        db.execute(HEAD_SCHEMA)
+        _seal_end(db, key)
+        db.execute("COMMIT")
     return db
+
+
+def _seal_end(db: sqlite3.Connection, key: bytes) -> None:
+    """Seal the newest row, in the transaction that wrote it."""
+    newest = db.execute("SELECT id, hash FROM journal ORDER BY id DESC LIMIT 1").fetchone() or (0, FIRST_HASH)
+    db.execute("INSERT OR REPLACE INTO head VALUES (1, ?, ?)", (newest[0], seal(key, *newest)))
 
 
 def _last_hash(db: sqlite3.Connection) -> str:
@@ -174,7 +186,7 @@ def _last_hash(db: sqlite3.Connection) -> str:
     return str(row[0]) if row is not None else FIRST_HASH
 
 
-def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_Entry]:
+def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry], key: bytes) -> list[_Entry]:
     """Write a group in one transaction and notify its callers; returns the notes that did not fit on the disk."""
     if not group:
         return []
@@ -182,6 +194,7 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry]) -> list[_En
         db.execute("BEGIN IMMEDIATE")
         for entry in group:
             _insert(db, entry)
+        _seal_end(db, key)
         db.execute("COMMIT")
     except sqlite3.Error as error:
         with contextlib.suppress(sqlite3.Error):  # after a failed commit this may fail too
@@ -206,7 +219,7 @@ def _insert(db: sqlite3.Connection, entry: _Entry) -> None:
     db.execute(INSERT_ROW, row)
 
 
-def hand_over(db: sqlite3.Connection, path: Path, *, part_bytes: int, keep_parts: int) -> None:
+def hand_over(db: sqlite3.Connection, path: Path, key: bytes, *, part_bytes: int, keep_parts: int) -> None:
     """Move all rows except the newest, which the chain continues from, to a new part; delete the oldest parts.
 
     Raises:
@@ -224,6 +237,7 @@ def hand_over(db: sqlite3.Connection, path: Path, *, part_bytes: int, keep_parts
     dropped = parts_of(path)[:-keep_parts]
     if dropped:
         _insert(db, _dropped(dropped))
+        _seal_end(db, key)
     db.execute("COMMIT")
     for part in dropped:
         part.unlink(missing_ok=True)

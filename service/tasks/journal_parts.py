@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
@@ -26,8 +27,29 @@ CREATE TABLE IF NOT EXISTS journal (
     hash TEXT NOT NULL UNIQUE
 )
 """
+HEAD_SCHEMA = "CREATE TABLE IF NOT EXISTS head (one INTEGER PRIMARY KEY CHECK (one = 1), last_id INTEGER, seal TEXT)"
 INSERT_ROW = "INSERT INTO journal VALUES (?,?,?,?,?,?,?)"
 Row = tuple[Any, ...]
+
+
+def key_of(live: Path) -> bytes:
+    """Return the secret that seals the end of the journal; makes it if there is none.
+
+    Raises:
+        OSError: it cannot be read or written.
+    """
+    live.parent.mkdir(parents=True, exist_ok=True)
+    path = live.with_suffix(".key")
+    try:
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        return path.read_bytes()
+    with os.fdopen(number, "wb") as file:
+        key = secrets.token_bytes(32)
+        file.write(key)
+        file.flush()
+        os.fsync(file.fileno())
+    return key
 
 
 def parts_of(live: Path) -> list[Path]:

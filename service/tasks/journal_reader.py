@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import hmac
 import json
 import sqlite3
 from collections.abc import Iterator
@@ -55,7 +56,8 @@ def verify_chain(path: Path) -> int:
     """Check the whole chain as far back as it is kept; returns the number of rows.
 
     Raises:
-        JournalError: a row was changed, removed or inserted (the error names it), or the journal cannot be read.
+        JournalError: a row was changed, removed or inserted (the error names it), the end was cut off, or the journal
+            cannot be read.
     """
     dropped = read_records(path, kinds=(DROPPED,), limit=1)
     previous, last_id = (dropped[0].data["hash"], dropped[0].data["id"]) if dropped else (FIRST_HASH, 0)
@@ -73,7 +75,32 @@ def verify_chain(path: Path) -> int:
                         row=number,
                     )
                 previous, last_id, count = real, number, count + 1
+        _check_end(path, live, last_id, previous)
     return count
+
+
+def _check_end(path: Path, live: sqlite3.Connection, last_id: int, last_hash: str) -> None:
+    """Compare the newest row with the sealed head, because a chain whose end was cut off is a chain as well."""
+    head = live.execute("SELECT last_id, seal FROM head").fetchone()
+    try:
+        key = path.with_suffix(".key").read_bytes()
+    except OSError as error:
+        raise JournalError(
+            f"the end of {path} cannot be checked: {error}",
+            hint="its key is beside it; only the service's user may read it",
+        ) from error
+    if head is None or (last_id, seal(key, last_id, last_hash)) != head:
+        kept = "no row" if head is None else f"row {head[0]}"
+        raise JournalError(
+            f"{path} ends at row {last_id}, but its sealed head names {kept}",
+            hint="somebody cut off its end; keep the file and begin a new one",
+            row=last_id,
+        )
+
+
+def seal(key: bytes, last_id: int, last_hash: str) -> str:
+    """Return the seal of a journal that ends with a row, which nobody can make without the key."""
+    return hmac.new(key, f"{last_id} {last_hash}".encode(), hashlib.sha256).hexdigest()
 
 
 def chain_hash(previous: str, wall_time_s: float, monotonic_s: float, kind: str, text: str) -> str:

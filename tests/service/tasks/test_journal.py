@@ -76,6 +76,32 @@ def test_every_change_breaks_the_chain(tmp_path: Path, change: str) -> None:
         journal.verify()
 
 
+@pytest.mark.parametrize("head", ["", "UPDATE head SET last_id = 2", "DELETE FROM head"])
+def test_a_chain_whose_end_was_cut_off_is_told(tmp_path: Path, head: str) -> None:
+    journal = Journal(tmp_path / "j.sqlite")
+    for i in range(5):
+        journal.append("tick", {"i": i})
+    journal.close()
+    assert journal.verify() == 5
+    with sqlite3.connect(tmp_path / "j.sqlite") as db:
+        db.execute("DELETE FROM journal WHERE id > 2")
+        db.execute(head or "SELECT 1")
+    with pytest.raises(JournalError, match="ends at row 2, but its sealed head names"):
+        journal.verify()
+
+
+def test_only_its_user_may_read_the_key_of_a_journal_and_an_older_journal_gets_one(tmp_path: Path) -> None:
+    Journal(tmp_path / "j.sqlite").close()
+    assert (tmp_path / "j.key").stat().st_mode & 0o077 == 0
+    (tmp_path / "j.key").unlink()
+    with sqlite3.connect(tmp_path / "j.sqlite") as db:
+        db.execute("DROP TABLE head")
+    journal = Journal(tmp_path / "j.sqlite")
+    journal.append("tick", {})
+    assert journal.verify() == 1
+    journal.close()
+
+
 SMALL = 60_000  # some hundred rows of `filled`
 
 

@@ -1,6 +1,7 @@
 """Tests of the RPLIDAR: conformance, resynchronisation without checksums, health, frames of the manual."""
 
 import math
+import random
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.emulators import rplidar as emulator
 from drivers.emulators.beams import line_m
+from drivers.emulators.faults import FaultOptions, FaultPlan
 from drivers.emulators.scripted import ScriptedScanner, scripted_scan
 from drivers.rplidar.express import CAPSULE_BYTES, REQUEST, CapsuleParser, decode_capsule, is_capsule, is_first
 from drivers.rplidar.nodes import NodeParser, decode
@@ -123,6 +125,37 @@ def test_a_turn_with_gaps_is_given_with_what_is_missing(
             assert abs(told - empty) <= 5 and lost_deg[0] <= told <= lost_deg[1]
         if mode == "standard":
             assert is_a_true_turn(sample.value, backing.reads)
+
+
+@pytest.mark.parametrize("mode", ["standard", "express"])
+def test_90_seconds_with_5_percent_of_bursts_damaged_give_true_turns_without_a_pause(mode: str) -> None:
+    """900 turns at ten a second, each at its own distance, are fed as fast as they are taken in."""
+    device = Rplidar(Context(name="scanner"), RplidarOptions(port="none", mode=mode, scan_rate_hz=10.0))
+    plan, chance = FaultPlan(FaultOptions(seed=5)), random.Random(5)
+    damages = (lambda _: b"", plan.lose_bytes, lambda burst: plan.noise(burst) + burst, lambda burst: burst + burst)
+    begin_s, stamps_s, wrong = now_s(), list[float](), 0
+    for turn in range(900):
+        range_m = np.full(384, 1.0 + 0.002 * turn)
+        if mode == "standard":
+            data = emulator.encode_turn(np.arange(384) * (math.tau / 384), range_m)
+        else:
+            data = emulator.encode_capsules(range_m, is_first=turn == 0)
+        size = len(data) // 12
+        for n in range(12):
+            burst = data[n * size : (n + 1) * size]
+            burst = chance.choice(damages)(burst) if chance.random() < 0.05 else burst
+            before = device.mailbox.published
+            if burst:
+                device.receive(burst, begin_s + (turn + (n + 1) / 12) / 10.0)
+            if device.mailbox.published > before:
+                sample = device.mailbox.peek()
+                stamps_s.append(sample.host_time_s)
+                ended = round((sample.host_time_s - begin_s) * 10.0) - 1  # the turn that ended at the stamp
+                off_m = np.abs(sample.value.depth_m - (1.0 + 0.002 * ended))
+                wrong += int(np.sum(off_m > 0.0015))
+    assert len(stamps_s) > 850
+    assert np.diff(stamps_s).max() < 0.35
+    assert wrong <= (3 if mode == "standard" else 0)  # measurements of standard scans have no check sum
 
 
 def test_less_than_half_of_a_turn_is_not_given() -> None:

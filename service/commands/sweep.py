@@ -75,6 +75,7 @@ def _run(seeds: Sequence[int], options: SweepOptions, *, scheduler: str, workers
 
         def note(run: PanelRun) -> None:
             runs.append(run)
+            write(runs, options, out)  # a sweep of hours may be killed
             bar.update(task, advance=1)
             bar.console.print(_lines(run, each=len(seeds) == 1))
 

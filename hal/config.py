@@ -118,6 +118,30 @@ class WorkspaceSection(Strict):
     ] = ()
 
 
+class HandSection(Strict):
+    """`[hand]`: the fingers on the gripper, or one rigid finger where there is none; all sizes in m.
+
+    The grip frame lies at the finger tips: z along the fingers, x in the closing direction.
+    """
+
+    fingers: Annotated[
+        Literal[1, 2], Field(description="2: two parallel fingers; 1: one rigid finger, which opens and grips nothing")
+    ] = 2
+    finger_thickness_m: Annotated[float, Field(gt=0, le=0.1, description="of one finger, along x")] = 0.007
+    finger_width_m: Annotated[float, Field(gt=0, le=0.1, description="of one finger, along y")] = 0.012
+    finger_length_m: Annotated[float, Field(gt=0, le=0.5, description="from the tips back to the body")] = 0.075
+    body_half_m: Annotated[Vector3, Field(description="half the edges of the body behind the fingers")] = (
+        0.0475,
+        0.030,
+        0.045,
+    )
+    body_back_m: Annotated[float, Field(gt=0, le=1, description="from the tips back to the middle of the body")] = 0.125
+    max_width_m: Annotated[float, Field(gt=0, le=0.5, description="largest opening of two fingers")] = 0.080
+    pad_stiffness_n_per_m: Annotated[
+        float, Field(gt=0, description="of the finger pads: a push of F moves the finger F/k past the surface")
+    ] = 7_000.0
+
+
 class CellFile(Strict):
     """Complete cell file."""
 
@@ -125,6 +149,7 @@ class CellFile(Strict):
     cell: CellSection
     devices: Annotated[dict[Name, DeviceSection], Field(min_length=1)]
     workspace: WorkspaceSection
+    hand: HandSection = HandSection()
     safety: SafetySection = SafetySection()
     simulation: SimulationSection = SimulationSection()
     emulators: dict[Name, EmulatorSection] = {}

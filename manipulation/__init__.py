@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from manipulation.arm.kinematics import Kinematics
     from manipulation.control.controller import Controller
     from manipulation.control.sensing import MotionDevices
+    from manipulation.planning.hand import Hand
     from manipulation.planning.shapes import CollisionBox
     from manipulation.planning.time_parameterization import SpeedLimits
     from manipulation.planning.touch_points import touch_points
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CollisionBox",
     "Controller",
+    "Hand",
     "Kinematics",
     "MotionDevices",
     "ObjectState",

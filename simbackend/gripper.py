@@ -18,15 +18,17 @@ RESOLUTION_M = 1e-5
 
 
 class SimGripper(SimDevice[GripperState]):
-    """Parallel gripper with a self-locking screw."""
+    """Parallel gripper with a self-locking screw; in a cell with one rigid finger it stays closed."""
 
     def __init__(self, context: Context, options: SimOptions) -> None:
         super().__init__(context, DeviceKind.GRIPPER, options)
+        is_rigid = context.cell is not None and context.cell.file.hand.fingers == 1
+        self._max_width_m = 0.0 if is_rigid else MAX_WIDTH_M
 
     def capabilities(self) -> GripperCapabilities:
         """Return the ranges of width, force and speed."""
         return GripperCapabilities(
-            min_width_m=0.0, max_width_m=MAX_WIDTH_M, max_force_n=MAX_FORCE_N, max_speed_m_per_s=MAX_SPEED_M_PER_S
+            min_width_m=0.0, max_width_m=self._max_width_m, max_force_n=MAX_FORCE_N, max_speed_m_per_s=MAX_SPEED_M_PER_S
         )
 
     def read_state(self, *, deadline: Deadline) -> Stamped[GripperState]:
@@ -50,7 +52,7 @@ class SimGripper(SimDevice[GripperState]):
                 hint="check the skill",
                 device=self._name,
             )
-        width_m = min(max(width_m, 0.0), MAX_WIDTH_M)
+        width_m = min(max(width_m, 0.0), self._max_width_m)
         self._world.aim_gripper(width_m, min(force_n, MAX_FORCE_N), min(speed_m_per_s, MAX_SPEED_M_PER_S))
         return width_m
 

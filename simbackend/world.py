@@ -113,7 +113,8 @@ class World:
         engine.enableJointForceTorqueSensor(self.arm, self.sensor, 1)
         park = np.asarray(self.cell.file.workspace.park_rad, float)
         self.drive = ArmDrive(self.model.capabilities, park, self.dt_s, lookahead_s=self.config.lookahead_s)
-        self.gripper = GripperDrive(self.dt_s)
+        is_rigid = self.cell.file.hand.fingers == 1  # the two fingers stay together as one
+        self.gripper = GripperDrive(self.dt_s, width_m=0.0, _target_m=0.0) if is_rigid else GripperDrive(self.dt_s)
         places = [*park, self.gripper.width_m / 2, self.gripper.width_m / 2]
         for joint, place in zip(self.moving, places, strict=True):
             engine.resetJointState(self.arm, joint, place)

@@ -7,14 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from hal.config import HandSection
+from hal.errors import Unsupported
 from manipulation.planning.shapes import Capsule, Vector3
+
+CLOSED_M = 0.0005
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hand:
-    """A parallel gripper with two straight fingers; grip frame at the finger tips, z along the fingers, x closing.
+    """Two straight parallel fingers, or one rigid finger; grip frame at the tips, z along the fingers, x closing.
 
     Attributes:
+        fingers: 2, or 1 for a rigid finger.
         finger_thickness_m: along x; two closed fingers are twice as thick.
         finger_width_m: along y.
         finger_length_m: from the tips back to the body.
@@ -22,6 +27,7 @@ class Hand:
         pad_stiffness_n_per_m: stiffness of the pads; under a push of F the finger goes F/k past the surface.
     """
 
+    fingers: int = 2
     finger_thickness_m: float = 0.007
     finger_width_m: float = 0.012
     finger_length_m: float = 0.075
@@ -30,10 +36,28 @@ class Hand:
     max_width_m: float = 0.080
     pad_stiffness_n_per_m: float = 7_000.0
 
+    @classmethod
+    def of(cls, section: HandSection) -> Hand:
+        """Return the hand that a cell file describes; one rigid finger has no opening."""
+        sizes = section.model_dump()
+        return cls(**{**sizes, "max_width_m": sizes["max_width_m"] if section.fingers == 2 else 0.0})
+
     @property
     def closed_half_m(self) -> tuple[float, float]:
         """Half sizes along x and y of the closed fingertip."""
-        return self.finger_thickness_m, self.finger_width_m / 2
+        return self.fingers * self.finger_thickness_m / 2, self.finger_width_m / 2
+
+    def check_opens(self, width_m: float) -> None:
+        """Refuse a stroke for which the hand must open.
+
+        Raises:
+            Unsupported: the hand is one rigid finger.
+        """
+        if self.fingers == 1 and width_m > CLOSED_M:
+            raise Unsupported(
+                f"this stroke needs fingers that open by {1e3 * width_m:.0f} mm, and the hand is one rigid finger",
+                hint="use a cell with a gripper, or leave this control to one (hand.fingers in the cell file)",
+            )
 
     def capsules(self, flange_from_grip: RigidTransform, width_m: float) -> tuple[Capsule, ...]:
         """Return the fingers at an opening, the body and the wrist as capsules in flange axes."""
@@ -41,7 +65,7 @@ class Hand:
         across = width_m / 2 + self.finger_thickness_m / 2
         fingers = [
             _capsule(flange_from_grip, f"finger_{name}", (x, 0.0, -self.finger_length_m), (x, 0.0, -radius), radius)
-            for name, x in (("left", -across), ("right", across))
+            for name, x in ((("left", -across), ("right", across)) if self.fingers == 2 else (("left", 0.0),))
         ]
         half_x, half_y, half_z = self.body_half_m
         back = -self.body_back_m

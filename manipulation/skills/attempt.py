@@ -21,6 +21,7 @@ from hal.motion import (
     Quantity,
 )
 from manipulation.planning.cartesian_path import line, shifted, through
+from manipulation.planning.hand import CLOSED_M
 from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 
@@ -31,7 +32,6 @@ RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
 LET_GO_N = 15.0
-CLOSED_M = 0.0005
 GRASP_M_PER_S = 0.03
 ENDED = "the stroke ended as declared"
 FREE_N = 40.0  # a larger force in a move that should be free is a collision
@@ -192,7 +192,11 @@ class Attempt:
 
         Args:
             options: for each stroke its panel_from_grip poses, the first at the standoff.
+
+        Raises:
+            Unsupported: the hand must open for it and cannot; nothing has moved.
         """
+        self.context.hand.check_opens(width_m)
         index, path = self.context.choose(options, near_rad=self.joints(), width_m=width_m, may_touch=may_touch)
         self.go_to_opening(path[0], width_m=width_m, name=f"to {name}")
         self.context.mover.tare()

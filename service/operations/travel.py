@@ -13,6 +13,7 @@ from hal.geometry import transform_rpy
 from hal.motion import JointTrajectory, MotionOutcome, MotionReport
 from manipulation import (
     CollisionBox,
+    Hand,
     Kinematics,
     SkillContext,
     SpeedLimits,
@@ -111,6 +112,7 @@ def skill_context(session: Session) -> SkillContext:
         base_from_panel=session.believed_panel(),
         flange_from_grip=session.mount(session.first(DeviceKind.GRIPPER)).parent_from_child,
         limits=SpeedLimits(tip_m_per_s=file.safety.speed_limit_m_per_s),
+        hand=Hand.of(file.hand),
         park_rad=np.array(file.workspace.park_rad),
         angles_rad=lever_angles(session),
         floor_z_m=file.workspace.floor_z_m,

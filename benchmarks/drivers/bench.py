@@ -25,6 +25,8 @@ class Bench:
     """Reads the device until a deadline."""
     is_plugged: bool = True
     """Whether the far side can be unplugged."""
+    is_alone: bool = False
+    """Whether only one such far side can run on a machine."""
     taken_s: Callable[[Any, Any], float] | None = None
     """Returns when a value was taken (monotonic clock); None if the value or the protocol does not reveal it."""
     stamps: Literal["log", "own log", "taken"] | None = "log"

@@ -8,6 +8,7 @@ from typing import Any
 
 from benchmarks.drivers.bench import WITHOUT_CRC, Bench
 from benchmarks.drivers.camera_benches import CAMERA_BENCHES
+from benchmarks.drivers.gige_bench import GIGE_BENCHES
 from benchmarks.drivers.ros2_benches import ROS2_BENCHES
 from benchmarks.drivers.truths import (
     MovingArm,
@@ -194,6 +195,7 @@ BENCHES = (
     ),
     *ROS2_BENCHES,
     *CAMERA_BENCHES,
+    *GIGE_BENCHES,
     Bench(
         name="cia402",
         start=cia402.start,

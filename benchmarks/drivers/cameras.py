@@ -70,7 +70,7 @@ def _measure_reconnect() -> None:
             far[0].kill()
             far[0].wait()
             threading.Event().wait(0.5)
-            far[0] = _start()
+            far[0] = start_fake()
             answered_s, count = time.monotonic(), device.mailbox.published
             while device.mailbox.published == count and time.monotonic() < answered_s + 10.0:
                 threading.Event().wait(0.002)
@@ -85,7 +85,7 @@ def _connect() -> Any:
 
 @contextmanager
 def _fake() -> Iterator[list[subprocess.Popen[bytes]]]:
-    far = [_start()]
+    far = [start_fake()]
     try:
         yield far
     finally:
@@ -93,8 +93,9 @@ def _fake() -> Iterator[list[subprocess.Popen[bytes]]]:
         far[0].wait()
 
 
-def _start() -> subprocess.Popen[bytes]:
-    process = subprocess.Popen([FAKE, "-i", ADDRESS, "-s", "B1"])
+def start_fake(*arguments: str) -> subprocess.Popen[bytes]:
+    """Start Aravis' camera and wait until it answers."""
+    process = subprocess.Popen([FAKE, "-i", ADDRESS, "-s", "B1", *arguments])
     while True:
         try:
             probe(ADDRESS)

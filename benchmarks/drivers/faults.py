@@ -95,11 +95,16 @@ def matrix(items: Iterable[Bench], seconds: float) -> dict[Key, Cell]:
     """Run every cell of some test setups; returns the counts by name, fault and rate."""
     keys = [(item.name, str(fault), every) for item in items for every in RATES for fault in (*item.faults, MIXED)]
     order = sorted(keys, key=lambda key: (key[1], key[2], key[0]))  # a batch mixes light and heavy devices
-    batches = [order[i : i + AT_ONCE] for i in range(0, len(order), AT_ONCE)]
+    alone = [key for key in order if bench(key[0]).is_alone]
+    order = [key for key in order if key not in alone]
     cells: dict[Key, Cell] = {}
-    with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
-        for batch, found in zip(batches, pool.map(run_batch, batches, [seconds] * len(batches)), strict=True):
-            cells.update(zip(batch, found, strict=True))
+    for processes, batches in (
+        (PROCESSES, [order[i : i + AT_ONCE] for i in range(0, len(order), AT_ONCE)]),
+        (1, [[key] for key in alone]),
+    ):
+        with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+            for batch, found in zip(batches, pool.map(run_batch, batches, [seconds] * len(batches)), strict=True):
+                cells.update(zip(batch, found, strict=True))
     return cells
 
 

@@ -78,8 +78,10 @@ def part_isolation(seconds: float) -> None:
     drivers), and at real-time priority.
     """
     names = tuple(
-        item.name for item in BENCHES if item.far_options.get("transport") != "virtual"
-    )  # in one process only
+        item.name
+        for item in BENCHES
+        if item.far_options.get("transport") != "virtual" and item.is_plugged and not item.is_alone
+    )  # a virtual bus is in one process only; a file and a lone program take no orders
     for priority, word in PRIORITIES:
         with far_process(*names) as far, realtime(priority, far.pid) as is_given, ExitStack() as stack:
             if not is_given:

@@ -32,6 +32,8 @@ COARSE_RAD = 5e-4  # joint steps of this size or more cause larger inertial forc
 REST_S = 0.12  # vibration has decayed by then, and the mean over the second half resolves 0.1 N
 REST_RATIO = 0.4  # of the force that stopped the move; creeping pads and friction may reduce it this far
 LEAST_M = 0.0005
+LIGHT = "light contact"
+START_SHARE = 0.2  # of the samples of a move: the arm speeds up, which looks like a light contact
 MOST_TRIES = 24  # an object that yields at once leaves no force at rest either, so the number of tries is limited
 
 
@@ -52,12 +54,23 @@ class Meeting:
 
 
 def meet(
-    attempt: Attempt, goal: RigidTransform, *, name: str, speed_m_per_s: float, stop_n: float, ticks: int = 2
+    attempt: Attempt,
+    goal: RigidTransform,
+    *,
+    name: str,
+    speed_m_per_s: float,
+    stop_n: float,
+    ticks: int = 2,
+    light: tuple[float, int] | None = None,
 ) -> Meeting:
     """Move straight to `goal` (base_from_grip, same rotation) until a force of `stop_n` against the motion.
 
     If the arm moves in jerks, the hand's own inertia can look like a contact: a servo resolution of 1.5 mrad causes
     several newtons. On such an arm a force that is gone at rest was no contact, and the move goes on.
+
+    Args:
+        light: a smaller force (N) that is also a contact if it lasts for a number of ticks, as that of an object that
+            yields does; not on an arm that moves in jerks.
     """
     start = attempt.pose()
     ahead = goal.translation - start.translation
@@ -65,9 +78,11 @@ def meet(
     unit = ahead / length
     in_tool = start.rotation.inv().apply(-unit)
     axis = (float(in_tool[0]), float(in_tool[1]), float(in_tool[2]))
-    guard = Guard(name="contact", quantity=Quantity.FORCE, limit=stop_n, axis=axis, ticks=ticks)
+    guards = [Guard(name="contact", quantity=Quantity.FORCE, limit=stop_n, axis=axis, ticks=ticks)]
+    if light is not None and not _shakes(attempt):
+        guards.append(Guard(name=LIGHT, quantity=Quantity.FORCE, limit=light[0], axis=axis, ticks=light[1]))
     for _ in range(MOST_TRIES):
-        report = attempt.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=(guard,))
+        report = attempt.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=tuple(guards))
         deepest = float((report.base_from_tool.translation - start.translation) @ unit)
         if report.tripped is None or length - deepest < LEAST_M or not _shakes(attempt):
             break
@@ -75,7 +90,7 @@ def meet(
             break
     depth = (report.log.tip_m - start.translation) @ unit
     force = report.log.wrench[:, :3] @ in_tool
-    way, give = onset(depth, force, deepest)
+    way, give = (step(depth, force), 0.0) if report.tripped == LIGHT else onset(depth, force, deepest)
     return Meeting(way_m=way, give_n_per_m=give, is_met=report.tripped is not None, report=report)
 
 
@@ -108,6 +123,23 @@ def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, floa
     if slope <= 0.0:
         return float(d[0]), 0.0
     return float(np.clip(-offset / slope, depth_m[0], d[0])), float(slope)
+
+
+def step(depth_m: Array, force_n: Array) -> float:
+    """Return the depth (m) at which a force that stays constant begins: the best split into two means.
+
+    Args:
+        depth_m, force_n: (N,) in the order of time; the last samples show the force.
+    """
+    first = min(int(START_SHARE * len(force_n)), max(0, len(force_n) - 6))
+    f = force_n[first:]
+    if len(f) < 4:
+        return float(depth_m[-1])
+    n = np.arange(1, len(f))
+    total = np.cumsum(f)
+    before, after = total[:-1] / n, (total[-1] - total[:-1]) / (len(f) - n)
+    gain = np.where(after > before, n * (len(f) - n) * (after - before) ** 2, 0.0)
+    return float(depth_m[first + 1 + int(gain.argmax())])
 
 
 def against_turn(start: RigidTransform, hub_m: Array, axis: Array) -> tuple[float, float, float]:

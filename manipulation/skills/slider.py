@@ -1,4 +1,8 @@
-"""Moves a slider: locates a face of its cap by touch and pushes it by the missing distance."""
+"""Moves a slider: locates a face of its cap by touch and pushes it by the missing distance.
+
+Two witnesses must agree before the deed is done: the look afterwards, and the look before together with the way that the
+fingertip pushed the cap.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.errors import InvalidRequest
 from hal.motion import Guard, Quantity
-from hal.panel import Slider
+from hal.panel import Scale, Slider
 from manipulation.planning.cartesian_path import shifted
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import force_at_rest_n, meet
@@ -22,10 +26,15 @@ TIP_HEIGHT_M = 0.007  # height of the fingertip above the plate; with a pose err
 SIDE_M = 0.009  # free space between fingertip and cap when approaching
 SEEK_M = 0.022
 SEEK_M_PER_S = 0.02
-SEEK_N = 1.3  # below the friction of a light slider, above noise and inertia
+SEEK_N = 1.3  # above noise and inertia, and below the friction of most sliders
+# The friction of a lighter slider is felt by its duration: the arm speeds up for 20 ticks only, and noise of 0.3 N is not
+# above this force for so long.
+LIGHT_N, LIGHT_TICKS = 0.5, 25
 PUSH_M_PER_S = 0.05
 SHORT_M = 0.003  # the push pauses at this distance from the end to measure the compression of the pads
 TOLERANCE_RATIO = 0.02
+LARGEST_STOP_N = 36.0
+AGREE_M = 0.002  # largest difference of the two witnesses; three sigmas of two looks and of the contact with the cap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,9 +79,18 @@ def slider(
     where = InitialState(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
     allowed = TOLERANCE_RATIO * (scale.maximum - scale.minimum)
 
+    felt_m: list[float] = []
+
     def stroke(attempt: Attempt) -> float:
+        felt_m.clear()
         push = _Push(start_m=scale.place_of(where.known), goal_m=scale.place_of(target))
-        return where.moved_to(scale.value_at(push.start_m + _push(attempt, fader, push)))
+        felt_m.append(push.start_m + _push(attempt, fader, push))
+        return where.moved_to(scale.value_at(felt_m[0]))
+
+    def is_reached(seen: ObjectState) -> bool:
+        if not surely_within(seen.value, target, allowed, sigma=seen.sigma):
+            return False
+        return agree(scale, seen.value, felt_m[0] if felt_m else None)
 
     return perform(
         context,
@@ -80,9 +98,14 @@ def slider(
         skill="slider",
         object_name=name,
         target=f"{target:g} {scale.unit}".strip(),
-        is_reached=lambda seen: surely_within(seen.value, target, allowed, sigma=seen.sigma),
+        is_reached=is_reached,
         verify=where.verify,
     )
+
+
+def agree(scale: Scale, seen: float | None, felt_m: float | None) -> bool:
+    """Return whether a look at the slider and the place to which it was felt to be pushed agree; not if one is missing."""
+    return seen is not None and felt_m is not None and abs(scale.place_of(seen) - felt_m) <= AGREE_M
 
 
 def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:
@@ -108,6 +131,7 @@ def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:
         speed_m_per_s=SEEK_M_PER_S,
         stop_n=SEEK_N,
         ticks=3,
+        light=(LIGHT_N, LIGHT_TICKS),
     )
     if not met.is_met:
         raise SkillFailure(Outcome.MISSED, "no cap was met")
@@ -149,12 +173,14 @@ def _moved(attempt: Attempt, way_m: np.ndarray) -> RigidTransform:
 def _go(attempt: Attempt, fader: Slider, ahead: np.ndarray, distance_m: float, name: str) -> None:
     if distance_m < 1e-4:
         return
-    limit = 3.0 * fader.friction_n + 15.0
+    limit = min(3.0 * fader.friction_n + 15.0, LARGEST_STOP_N)
     guard = Guard(name="effort", quantity=Quantity.FORCE, limit=limit)
+    start = attempt.pose().translation
     report = attempt.straight(
         _moved(attempt, distance_m * ahead), name=name, speed_m_per_s=PUSH_M_PER_S, guards=(guard,)
     )
-    if report.tripped is not None:
+    left_m = distance_m - float((report.base_from_tool.translation - start) @ ahead)
+    if report.tripped is not None and left_m > SHORT_M:  # at the end of the track the stop comes a little early
         raise SkillFailure(Outcome.STALLED, f"the cap stopped against {report.peak_force_n:.0f} N")
 
 

@@ -22,6 +22,7 @@ GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a 
 SIDE_M = 0.008  # free space between fingertip and bat when approaching; more than the pose error
 BEYOND_M = 0.013  # distance of the fingertip's face beyond the middle at the end of a free sweep
 SWEEP_M_PER_S = 0.03
+FIRST_N = 24.0  # of the first try; the fingertip ends it against the bat's stop, some newtons higher
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 END_N = 4.0  # added to the force of the detent, so that the bat is at its stop
 
@@ -84,13 +85,13 @@ def toggle(
     if target not in ("on", "off"):
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
     up = 1.0 if target == "on" else -1.0
-    tries = itertools.count()
+    tries, throws = itertools.count(), itertools.count()
 
     def stroke(attempt: Attempt) -> float | None:
         is_said_there = current is not None and current.state == target and next(tries) == 0
         if is_said_there and verify is not None and (seen := verify()) is not None and seen.state == target:
             return None
-        return throw(attempt, switch, up)
+        return throw(attempt, switch, up, most_n=FIRST_N if next(throws) == 0 else np.inf)
 
     return perform(
         context,
@@ -103,12 +104,15 @@ def toggle(
     )
 
 
-def throw(attempt: Attempt, switch: Handle, up: float, *, grip_ratio: float = GRIP_RATIO) -> float:
+def throw(
+    attempt: Attempt, switch: Handle, up: float, *, grip_ratio: float = GRIP_RATIO, most_n: float = np.inf
+) -> float:
     """Approach beside the bat and sweep it over; returns how far past the pivot the fingertip's face came, m.
 
     Args:
         up: 1 or -1.
         grip_ratio: how far up the bat the fingertip pushes, over its length; a flat handle may be pushed near its end.
+        most_n: largest force of this try, where a further one may use all that the switch may need.
 
     Raises:
         SkillFailure: the bat did not give way, or the fingertip did not come down beside it.
@@ -119,11 +123,12 @@ def throw(attempt: Attempt, switch: Handle, up: float, *, grip_ratio: float = GR
     y = switch.position_m[1]
     start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
     _come_down(attempt, switch, start, end, PIVOT_M + grip_ratio * switch.bat_length_m)
-    stop_n = stop_force_n(switch)
+    stop_n = min(stop_force_n(switch), most_n)
     moved = _sweep(attempt, end - start, stop_n)
     past = float(moved - (abs(end - start) - BEYOND_M))
     if past < -0.004:
-        raise SkillFailure(Outcome.STIFF, f"the bat did not give way at {stop_n:.0f} N", reached=past)
+        outcome = Outcome.STALLED if stop_n == most_n else Outcome.STIFF
+        raise SkillFailure(outcome, f"the bat did not give way at {stop_n:.0f} N", reached=past)
     attempt.leave()
     return past
 

@@ -31,6 +31,7 @@ LINE_NEAR = 0.17
 # Least contrast of a line: in sigmas of the contrast's noise, and as a share of the cap's edge
 LINE_NOISES, LINE_SHARE = 2.0, 0.15
 NO_LINE = 0.75  # of 12 caps in bad light without a visible line 8 were correct, because cables and glare resemble caps
+PLACE_PX = 0.35  # standard deviation of the middle of a cap, image px
 BEYOND, MOST_BEYOND = 0.8, 0.4  # in cap widths from the track; share that may be as dark there
 SIDES = np.linspace(-0.40, 0.40, 17)  # in cap widths: inside the cap
 
@@ -74,7 +75,7 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     status = PatchReading(
         value=spec.scale.value_at(place),
         unit=spec.scale.unit,
-        uncertainty=slope * float(np.hypot(0.5 / patch.image_px_per_m, track.sigma_m)),
+        uncertainty=slope * float(np.hypot(PLACE_PX / patch.image_px_per_m, track.sigma_m)),
         confidence=confidence,
     )
     return gated(status) if found.peak >= 2.0 * noise else doubted(status, unseen)

@@ -16,7 +16,7 @@ from hal.panel import Lamp
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.attempt import Attempt
-from manipulation.skills.contact import onset
+from manipulation.skills.contact import onset, step
 from manipulation.skills.context import SkillContext
 from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, surely_within, wrapped
@@ -254,3 +254,14 @@ def test_a_wrapped_angle_is_the_same_direction(angle: float) -> None:
     assert -np.pi < wrapped(angle) <= np.pi + 1e-12
     assert np.cos(wrapped(angle)) == pytest.approx(np.cos(angle), abs=1e-9)
     assert np.sin(wrapped(angle)) == pytest.approx(np.sin(angle), abs=1e-9)
+
+
+@pytest.mark.parametrize("noise_n", [0.0, 0.15, 0.3])
+def test_a_light_contact_begins_where_the_mean_force_steps_up(noise_n: float) -> None:
+    """A slider with a friction of 1.0 N never raises the force above the threshold of a contact."""
+    depth = np.linspace(0.0, 0.012, 75)
+    misses = []
+    for seed in range(20):
+        noise = noise_n * np.random.default_rng(seed).standard_normal(75)
+        misses.append(step(depth, np.where(depth > 0.009, 1.0, 0.0) + noise) - 0.009)
+    assert np.abs(misses).max() < 0.0009 and abs(float(np.median(misses))) < 0.0003

@@ -20,7 +20,7 @@ from hal.motion import (
     MotionReport,
     RobotState,
 )
-from hal.panel import load_panel
+from hal.panel import Scale, load_panel
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.attempt import Attempt
@@ -29,6 +29,7 @@ from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 from manipulation.skills.probe import proximity_probe
 from manipulation.skills.retreat import PULLS, park, retreat
+from manipulation.skills.slider import agree
 from manipulation.skills.toggle import toggle
 from tests.manipulation.arms import T3
 from tests.manipulation.rig import HOME
@@ -188,3 +189,11 @@ def test_a_distance_that_few_samples_saw_is_none() -> None:
     mover.distances_m = [0.05] * 4 + [np.nan] * 6
     with pytest.raises(SkillFailure, match="no proximity sensor"):
         proximity_probe(context, (0.0, 0.06, 0.0), flange_from_sensors=[GRIP])
+
+
+def test_a_slider_is_done_only_where_look_and_push_agree() -> None:
+    """A look that was 3 mm off said `done` of a slider that stood 2.4 % beside its goal."""
+    scale = Scale(minimum=0.0, maximum=100.0, unit="%", at_min=-0.05, at_max=0.05)
+    assert agree(scale, 70.0, 0.0195)
+    assert not agree(scale, 70.0, 0.0165)
+    assert not agree(scale, 70.0, None) and not agree(scale, None, 0.02)

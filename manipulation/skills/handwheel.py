@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.errors import InvalidRequest, Unreachable
+from hal.motion import CartesianPath, Compliance
 from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
 from manipulation.skills.attempt import STANDOFF_M, Attempt
@@ -29,14 +30,22 @@ HOLDS_RAD = (
     1.3,
 )  # largest turns of one hold that are tried, in this order; the arm's wrist allows one of them
 RIM_HOLDS_RAD = (1.7, 0.9)
-PUSH_N = 46.0  # of one finger on a spoke; the soft pads of the bench slip past it at 55 N
-STATED_RATIO = 1.3  # a stated effort that is this far beyond what the spokes take is believed without trying
-SIDE_N = 85.0  # of the hand on the rim
+INF = float("inf")
+PUSH_N = 50.0  # of one finger on a spoke; the soft pads of the bench slip past it at 58 N
+SIDE_N = 65.0  # of the hand on the rim; a heavier wheel would load the arm with more than 100 N
 RIM_SIDE_M = 0.009  # largest free space between each finger and the rim when approaching
 SPARE_M = 0.001
 SPOKE_GAP_M = 0.0025  # between the inner finger and the spoke beside which it holds the rim
 FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
-GRIP_N = (20.0, 50.0)  # smallest and largest force of the pads; above 60 N the soft pads of the bench slip over the rim
+GRIP_N = (12.0, 30.0)  # smallest and largest force of the pads; with 45 N friction along the fingers reached 70 N
+LIGHT_N, SETTLE_S, SETTLES = 8.0, 0.4, 6
+SETTLED_RATIO = 2.0  # of the rim's radius: the opening at which both pads press
+# Pads that press lightly centre the hand on the rim before they press firmly: both pads move by one screw, so a rim that is
+# off their middle by 2 mm would push the arm aside with all of the grip force.
+SIDEWAYS = Compliance(
+    stiffness=(0.0, INF, INF, INF, INF, INF), damping=(600.0,) * 3 + (10.0,) * 3, mass=(60.0,) * 3 + (1.0,) * 3,
+    max_offset_m=0.006,
+)  # fmt: skip
 TOLERANCE_RAD = np.radians(6.0)
 AT_STOP_RAD = 0.35
 SAME_RAD = 0.6  # a look that differs by more from where the wheel was left shows that somebody else has turned it
@@ -48,18 +57,6 @@ class _Belief:
     """What is believed of the wheel's effort: the panel file's, then the felt one."""
 
     effort_nm: float
-    is_felt: bool = False
-
-    def suits(self, holds: tuple[SpokeHold, ...]) -> bool:
-        """Return whether two fingers on the spokes may turn it."""
-        if not holds:
-            return False
-        spread = 1.0 if self.is_felt else STATED_RATIO
-        return self.effort_nm < spread * 2.0 * PUSH_N * holds[0].arm_m
-
-    def feel(self, effort_nm: float) -> None:
-        """Take over an effort that was felt: it moves the wheel, or is the least that does."""
-        self.effort_nm, self.is_felt = effort_nm, True
 
 
 def handwheel(
@@ -152,20 +149,18 @@ def _turn_once(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: 
         Unreachable: the arm cannot turn its hand about this hub.
     """
     holds = spoke_holds(wheel, attempt.context.hand, where.known, float(np.sign(span_rad)))
-    by_spokes = belief.suits(holds)
     turn, part_rad = (
-        _behind_spokes(attempt, wheel, holds, span_rad) if by_spokes else _at_the_rim(attempt, wheel, where.known, span_rad, belief)
+        _behind_spokes(attempt, wheel, holds, span_rad) if holds else _at_the_rim(attempt, wheel, where.known, span_rad, belief)
     )  # fmt: skip
     angle_rad, sign = where.known, float(np.sign(span_rad))
     try:
         turn.turn(part_rad)
         where.moved_to(angle_rad + sign * turn.moved_rad)
-        belief.feel(turn.felt_nm)
+        belief.effort_nm = turn.felt_nm
     except SkillFailure as failure:
         where.moved_to(at_a_stop(wheel, angle_rad + sign * turn.moved_rad, sign, failure.outcome))
-        belief.feel(turn.felt_nm)
-        if not by_spokes or failure.outcome is not Outcome.STIFF:
-            raise
+        belief.effort_nm = turn.felt_nm
+        raise
     finally:
         turn.let_go()
 
@@ -226,6 +221,7 @@ def _at_the_rim(
     _come_down(attempt, wheel, RIM_DEPTH_M)
     centre_between(attempt, room_m=2.0 * side, what="rim")
     grip_n = float(np.clip(belief.effort_nm / (2.0 * FRICTION * wheel.radius_m), *GRIP_N))
+    _settle_on(attempt, wheel)
     left = attempt.grasp(grip_n, name="hold the rim")
     if left < 0.4 * wheel.rim_m:
         raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * left:.1f} mm; no rim between them")
@@ -234,6 +230,19 @@ def _at_the_rim(
         up_m=STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, open_m=width,
     )  # fmt: skip
     return turn, part
+
+
+def _settle_on(attempt: Attempt, wheel: Handwheel) -> None:
+    """Close lightly and let the hand yield sideways, until both pads are at the rim."""
+    for _ in range(SETTLES):
+        if attempt.grasp(LIGHT_N, name="touch the rim") < SETTLED_RATIO * wheel.rim_m:
+            return
+        here = attempt.pose()
+        settle = CartesianPath(
+            name="settle on the rim", flange_from_tool=attempt.context.flange_from_grip,
+            times_s=np.array([0.0, SETTLE_S]), base_from_tool=(here, here), compliance=SIDEWAYS,
+        )  # fmt: skip
+        attempt.run(settle)
 
 
 def free_side_m(wheel: Handwheel, hand: Hand) -> float:

@@ -22,6 +22,7 @@ NEXT_RAD = 0.3
 SHORTEST_RAD = np.radians(1.0)
 MOVED_RAD = 0.1  # a wheel that stops before is stiff, one that stops later has stalled
 LARGEST_SIDE_N = 85.0  # below the cell's protective limit
+LARGEST_HELD_N = 75.0  # the same with the rim between the fingers, where friction is released in jumps
 STOP_RATIO, STOP_NM = 1.4, 0.35  # an end stop is a torque above this multiple of the felt one plus this much
 SLIP_RATIO, SLIP_TICKS = 0.4, 10
 LOG_SAMPLES = 300
@@ -151,7 +152,8 @@ class WheelTurn:
     def _guards(self) -> tuple[Guard, ...]:
         """Return what ends a turn: more torque than the felt one, the largest push, or a hold that gives way."""
         against = (0.0, 0.0, -self.sign)  # the tool's z points into the panel, so a clockwise turn is positive about it
-        side = Guard(name="side force", quantity=Quantity.FORCE, limit=LARGEST_SIDE_N)
+        most_n = LARGEST_SIDE_N if self.open_m is None else LARGEST_HELD_N
+        side = Guard(name="side force", quantity=Quantity.FORCE, limit=most_n)
         if not self._felt.is_moving or self.open_m is not None:
             return Guard(name="effort", quantity=Quantity.TORQUE, limit=self.most_nm, axis=against), side
         limit = min(self.most_nm, STOP_RATIO * self._felt.running_nm + STOP_NM)

@@ -168,8 +168,18 @@ class Kinematics:
         _, jacobian = kernels.tool_and_jacobian(self.dh, q_rad, np.eye(4))
         return float(np.linalg.svd(BY_LENGTH * jacobian, compute_uv=False)[-1])
 
+    def follow_from(self, q_rad: Array, base_from_flange: Sequence[RigidTransform]) -> Array | None:
+        """Return the joints (N, n) that follow poses from joints (n,); None beyond limits, jumps or singularities."""
+        poses = np.array([pose.as_matrix() for pose in base_from_flange])
+        path: Array = branches.followed(self.dh, np.ascontiguousarray(q_rad), poses, LARGEST_STEP_RAD)
+        is_inside = len(path) == len(poses) and bool(np.all((path >= self.lower_rad) & (path <= self.upper_rad)))
+        return path if is_inside and self._is_regular(path) else None
+
+    def effort_s(self, path: Array, near_rad: Array) -> float:
+        """Return the time from joints (n,) to the begin of a path (N, n), longer where it nears limits or singularities."""
+        return self._effort(path, near_rad, min(self.conditioning(path[0]), self.conditioning(path[-1])))
+
     def _effort(self, path: Array, near_rad: Array, poor: float) -> float:
-        # Seconds to get there, plus a penalty for ending near a limit or a singularity.
         travel = np.max(np.abs(path[0] - near_rad) / self.velocity_rad_per_s)
         margin = np.min(np.minimum(path - self.lower_rad, self.upper_rad - path))
         return float(travel + 0.05 / (margin + 0.02) + 0.05 / (poor + 0.02))

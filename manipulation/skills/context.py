@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.errors import Unreachable
-from hal.geometry import UncertainPose, transform
+from hal.geometry import UncertainPose, interpolate, transform
 from hal.motion import JointTrajectory, Mover
 from hal.panel import Panel
 from manipulation.arm.kinematics import Kinematics
@@ -21,6 +21,8 @@ from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.planning.transfer import THOROUGH, Effort, TransferPlanner
 
 STROKE_MARGIN_M = 0.001
+WAY_BACK_M = 0.05
+NO_WAY_BACK_S = 3.0  # a stroke from which the hand cannot go straight back counts as so much longer
 REACH_TURNS_RAD = np.linspace(-np.pi, np.pi, 12, endpoint=False)
 FINGERS = ("finger_left", "finger_right")
 
@@ -102,7 +104,10 @@ class SkillContext:
     def choose(
         self, options: Sequence[Sequence[RigidTransform]], *, near_rad: Array, width_m: float, may_touch: Sequence[str]
     ) -> tuple[int, Array]:
-        """Return which of several strokes the arm can begin soonest, and its joints (N, n) along it.
+        """Return which of several strokes the arm does best, and its joints (N, n) along it.
+
+        The branch is chosen over the whole deed: way to the standoff, distance from joint limits and singularities on
+        the stroke, and whether the hand can go back along its fingers from the stroke's end.
 
         Args:
             options: for each stroke its panel_from_grip poses, the first at the standoff.
@@ -125,13 +130,23 @@ class SkillContext:
                     what = f"the stroke would bring {model.nearest(touching)} together"
                     failures.append(Unreachable(what, hint="another turn of the tool or a smaller opening may do"))
                     continue
-                cost = float(np.max(np.abs(path[0] - near_rad) / self.kinematics.velocity_rad_per_s))
+                goes_back = self._goes_back(model, flange[-1], path[-1])
+                cost = self.kinematics.effort_s(path, near_rad) + (0.0 if goes_back else NO_WAY_BACK_S)
                 if best is None or cost < best[0]:
                     best = (cost, index, path)
-                break
+                if goes_back:
+                    break
         if best is None:
             raise failures[-1]
         return best[1], best[2]
+
+    def _goes_back(self, model: CollisionModel, base_from_flange: RigidTransform, q_rad: Array) -> bool:
+        """Return whether the hand can move straight back along its fingers from the joints `q_rad` at a flange pose."""
+        back = self.flange_from_grip * RigidTransform.from_translation([0.0, 0.0, -WAY_BACK_M])
+        poses = [base_from_flange * interpolate(self.flange_from_grip, back, share) for share in (0.5, 1.0)]
+        poses = [pose * self.flange_from_grip.inv() for pose in poses]
+        path = self.kinematics.follow_from(q_rad, poses)
+        return path is not None and all(model.is_clear(q, margin_m=STROKE_MARGIN_M) for q in path)
 
 
 def panel_from_grip(point_m: Sequence[float], turn_rad: float) -> RigidTransform:

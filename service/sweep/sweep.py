@@ -21,6 +21,7 @@ from service.sweep.table import report
 
 RETRIES = 1  # of a panel whose worker died
 LOCAL = "local"
+DIGITS = 9
 
 
 def sweep(
@@ -57,9 +58,25 @@ def sweep(
 
 
 def hash_of(run: PanelRun) -> str:
-    """Return a hash of everything about a panel that a repetition must give again, that is, without the time on the wall."""
-    plain = {**asdict(run), "wall_s": 0.0}
+    """Return a hash of everything about a panel that a repetition must give again, that is, without the time on the wall.
+
+    Numbers count to `DIGITS` digits. The same processes repeat to the last bit; with the cell in the service's process
+    (`inline`) impulse and chatter differ in the 14th digit.
+    """
+    plain = _rounded({**asdict(run), "wall_s": 0.0})
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _rounded(value: Any) -> Any:
+    match value:
+        case float():
+            return float(f"{value:.{DIGITS}g}")
+        case dict():
+            return {key: _rounded(item) for key, item in value.items()}
+        case list() | tuple():
+            return [_rounded(item) for item in value]
+        case _:
+            return value
 
 
 def write(runs: Sequence[PanelRun], options: SweepOptions, folder: Path) -> tuple[Path, Path]:

@@ -42,7 +42,7 @@ def test_ten_random_panels_say_nothing_that_is_not_so(ten: list[PanelRun]) -> No
 
 
 @pytest.mark.slow
-def test_a_panel_repeats_bit_by_bit_in_another_process(ten: list[PanelRun]) -> None:
+def test_a_panel_repeats_in_other_processes(ten: list[PanelRun]) -> None:
     told: list[int] = []
     again = sweep([7002], options("toggle", inline=False), workers=2, progress=lambda run: told.append(run.seed))
     assert told == [7002]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hal.config import load_cell
+from hal.panel import Lever
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCH = load_cell(ROOT / "cells/bench.toml").panel
@@ -48,13 +49,17 @@ def drill_of(number: int) -> Drill:
     return makers[(number - 1) % len(makers)](rng)
 
 
+# The hand holds a lever this far from its hub, which is the place that a fault waits for.
+LEVER_M = {one.name: one.length_m for one in BENCH.objects if isinstance(one, Lever)}
+
+
 def _pick(rng: np.random.Generator, names: Sequence[str]) -> str:
     return str(rng.choice(list(names)))
 
 
 def _dead(kind: str, device: str, fault: str, rng: np.random.Generator, **more: Any) -> Drill:
     control = _pick(rng, OFTEN)
-    near_m = float(rng.uniform(0.03, 0.10))
+    near_m = float(rng.uniform(0.03, 0.10)) + LEVER_M.get(control, 0.0)
     when = {"kind": fault, "near": control, "near_m": round(near_m, 3), "at_s": 2.0}
     return Drill(kind=kind, control=control, device_fault=(device, when), outcomes=("error",), words=(device,), **more)
 

@@ -16,7 +16,7 @@ DAMPING_N_S_PER_M = 4.0
 TURN_DAMPING_NM_S_PER_RAD = 0.05
 SLIDE_DAMPING_N_S_PER_M = 5.0
 LOCK_EFFORT = 200.0
-BLOCKED_EFFORT = 2000.0  # N or N m
+BLOCKED_PLAY = 1e-4  # rad or m
 SNAP_GAIN_PER_S = 40.0
 
 
@@ -64,9 +64,8 @@ class Friction:
         _hold(self.engine, self.body, speed=0.0, effort=self.effort)
 
     def block(self) -> None:
-        """Let friction hold the part against any force."""
-        self.effort = BLOCKED_EFFORT
-        self.drive()
+        """Let the part not give way to any force from now on."""
+        _jam(self.engine, self.body)
 
     def place(self) -> float:
         """Return the joint position."""
@@ -93,13 +92,13 @@ class Spring:
     is_blocked: bool = False
 
     def block(self) -> None:
-        """Hold the cap where it is against any force."""
+        """Let the cap not give way to any force from now on."""
         self.is_blocked = True
-        _hold(self.engine, self.body, speed=0.0, effort=BLOCKED_EFFORT)
+        _jam(self.engine, self.body)
 
     def lock(self) -> None:
         """Hold the cap."""
-        _hold(self.engine, self.body, speed=0.0, effort=BLOCKED_EFFORT if self.is_blocked else LOCK_EFFORT)
+        _hold(self.engine, self.body, speed=0.0, effort=LOCK_EFFORT)
 
     def free(self) -> None:
         """Release the cap, so that `drive` alone moves it, unless it is blocked."""
@@ -165,8 +164,8 @@ class Detent:
         _hold(self.engine, self.body, speed=speed, effort=self.effort)
 
     def block(self) -> None:
-        """Let the detent hold the part against any force."""
-        self.effort = BLOCKED_EFFORT
+        """Let the part not give way to any force from now on."""
+        _jam(self.engine, self.body)
 
     def nearest(self, x: float) -> float:
         """Return the resting place nearest to `x`."""
@@ -180,3 +179,9 @@ class Detent:
 def _hold(engine: Any, body: int, *, speed: float, effort: float) -> None:
     """Set a velocity motor with limited effort, which acts as friction, brake or snap depending on speed and effort."""
     engine.setJointMotorControl2(body, JOINT, engine.VELOCITY_CONTROL, targetVelocity=speed, force=effort)
+
+
+def _jam(engine: Any, body: int) -> None:
+    """Put the joint's end stops where it is."""
+    place = float(engine.getJointState(body, JOINT)[0])
+    engine.changeDynamics(body, JOINT, jointLowerLimit=place - BLOCKED_PLAY, jointUpperLimit=place + BLOCKED_PLAY)

@@ -201,7 +201,7 @@ def _carry(attempt: Attempt, way: _Arc) -> float:
     """
     start = attempt.pose()
     felt_n = _turn_most(attempt, way, start, max(0.0, way.span_rad - LAST_RAD))
-    return _to_the_stop(attempt, way, start, LAST_M_PER_S if felt_n < HEAVY_N else LAST_HEAVY_M_PER_S)
+    return _to_the_stop(attempt, way, start, LAST_M_PER_S if felt_n < HEAVY_N else LAST_HEAVY_M_PER_S, felt_n)
 
 
 def _turn_most(attempt: Attempt, way: _Arc, start: RigidTransform, fast_rad: float) -> float:
@@ -276,12 +276,16 @@ class _Arc:
         return max(0.0, force_n) / attempt.context.hand.pad_stiffness_n_per_m / self.radius_m
 
 
-def _to_the_stop(attempt: Attempt, way: _Arc, start: RigidTransform, speed_m_per_s: float) -> float:
+def _to_the_stop(
+    attempt: Attempt, way: _Arc, start: RigidTransform, speed_m_per_s: float, felt_n: float = 0.0
+) -> float:
     """Move on slowly until the force rises where the end stop can be; an earlier rise is the bar's own friction.
 
     Returns the angle by which the bar turned since `start`.
     """
     rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N, axis=way.against)
+    if felt_n >= HEAVY_N:  # at the lower speed the force rises hardly faster than its running median
+        rise = Guard(name="end stop", quantity=Quantity.FORCE, limit=felt_n + END_RISE_N, axis=way.against)
     tries = 0
     while True:
         tries += 1

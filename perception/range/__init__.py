@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from perception.range.recordings import Reading, assumptions, load_recording
     from perception.range.render import MARK, match_json, picture, scene_json, write_ply, write_png
     from perception.range.sensor import OrthographicSensor, PinholeSensor
-    from perception.range.sweep import ScannerTrack, SweepPass, SweptMount, image_from_sweep
+    from perception.range.sweep import ScannerTrack, SweepPass, image_from_sweep
     from perception.range.warm import warm_up
 
 __all__ = [
@@ -43,7 +43,6 @@ __all__ = [
     "Surface",
     "SurfaceType",
     "SweepPass",
-    "SweptMount",
     "analyse",
     "assumptions",
     "batch_range",

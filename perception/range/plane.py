@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest, NotFound
+from hal.geometry import UncertainPose
 from perception.range.analysis import checked_depth
 from perception.range.features import RangeFeature, plane_feature
 from perception.range.fitting.surfaces import PLANE, SIZE
@@ -55,7 +56,7 @@ def fit_plane_near(
     sigma_offset_m: float = 0.02,
     sigma_angle_rad: float = 0.1,
     noise: NoiseModel | None = None,
-    swept: SweptMount | None = None,
+    swept: UncertainPose | None = None,
 ) -> PlaneFit:
     """Fit the largest plane that agrees with an expected one within three standard deviations.
 
@@ -66,7 +67,7 @@ def fit_plane_near(
         point_m, normal: (3,) expected plane in the sensor frame; the normal may point either way.
         sigma_offset_m, sigma_angle_rad: standard deviations of the expectation.
         noise: noise model to use instead of an estimate from the image.
-        swept: mount of the line scanner from whose sweep the image was put together.
+        swept: mount on the flange of the line scanner from whose sweep the image was put together.
 
     Raises:
         InvalidRequest: the image, sensor or expectation is not usable.
@@ -93,7 +94,7 @@ def fit_plane_near(
     )
     if plane is None:
         raise _nothing_near(sigma_offset_m, sigma_angle_rad)
-    return _fitted(depth, sensor, law, plane, swept)
+    return _fitted(depth, sensor, law, plane, None if swept is None else SweptMount.of(swept))
 
 
 def _checked_expectation(

@@ -13,7 +13,7 @@ from hal.camera_model import project
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose, compose, difference
 from hal.panel import Panel, PanelObject, Rim
-from perception.range import PlaneFit, SweptMount, fit_plane_near
+from perception.range import PlaneFit, fit_plane_near
 from perception.vision import ObjectReading, PanelWay, RimView, find_rims, viewpoints
 from service.operations.acquisition import Look, Scan, scan
 from service.operations.find_panel import Located, locate
@@ -103,7 +103,7 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
         normal=pose.rotation.apply([0.0, 0.0, 1.0]),
         sigma_offset_m=float(max(sigma[:3].max(), 0.005)),
         sigma_angle_rad=float(max(sigma[3:].max(), 0.01)),
-        swept=SweptMount.of(session.mount(image.scanner)) if image.is_swept else None,
+        swept=session.mount(image.scanner) if image.is_swept else None,
     )
     flange = session.mover.state().base_from_flange
     observation = PlaneObservation(

@@ -184,7 +184,11 @@ def test_the_errors_of_a_mount_turn_the_swept_plane_as_far_as_its_covariance_say
         # What the true camera sees in its own frame is taken for the believed frame.
         point_m, normal = view_from_true.inv().apply(POINT_M), view_from_true.rotation.inv().apply(NORMAL)
         feature = fit_plane_near(
-            depth_m, view, point_m=point_m, normal=normal, swept=SweptMount(covariance=covariance)
+            depth_m,
+            view,
+            point_m=point_m,
+            normal=normal,
+            swept=UncertainPose(parent_from_child=identity(), covariance=covariance),
         ).feature
         offset = normal @ (feature.point_m - point_m) / feature.sigma_point_m
         turn = feature.direction - normal

@@ -28,8 +28,7 @@ DEMAND_S, MOST_DEMANDS = 0.01, 400  # the demand of a path on the joints is comp
 USABLE = 0.9  # share of the joint limits that it may ask for; compliance and the closing of the gap need the rest
 SMALL_BEND_RAD = 0.2  # between samples of an arc; more is a corner
 MOST_STRETCH = 4.0  # more only happens next to a singularity
-GRIP_START_S = 0.08  # a gripper needs this long to report that it moves
-GRIP_REST_S = 0.05
+GRIP_START_S, GRIP_REST_S = 0.08, 0.05  # a gripper needs the first to report that it moves, and rests for the second
 log = logging.getLogger(__name__)
 
 

@@ -49,7 +49,7 @@ def unit_faults(data: Any, key: str = "") -> list[FieldFault]:
         return [
             FieldFault(key, f"{_short(data)} is more than a full turn", f"if these are degrees, write {as_rad} rad")
         ]
-    if name.endswith("_m") and any(abs(n) > LARGEST_M for n in numbers):
+    if name.endswith("_m") and not name.endswith("_per_m") and any(abs(n) > LARGEST_M for n in numbers):
         as_m = ", ".join(f"{n / 1e3:.4g}" for n in numbers)
         return [FieldFault(key, f"{_short(data)} is larger than a cell", f"if these are millimetres, write {as_m} m")]
     return []

@@ -29,7 +29,7 @@ LAST_RAD = np.radians(9.0)  # the last part is slow; at full speed the force at 
 OVERTRAVEL_RAD = np.radians(12.0)  # compression of the pads
 LAST_M_PER_S = 0.018
 HEAVY_N, LAST_HEAVY_M_PER_S = 45.0, 0.009  # a heavy bar is brought to its end stop more slowly: less overshoot
-END_RISE_N = 8.0
+END_RISE_N, HEAVY_RISE_N = 8.0, 4.0  # the stop of a heavy bar is met with little more than its friction
 # If the tool stops by more than this angle before the state, the cause is friction and not the end stop.
 SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
@@ -285,7 +285,7 @@ def _to_the_stop(
     """
     rise = Guard(name="end stop", quantity=Quantity.FORCE_RISE, limit=END_RISE_N, axis=way.against)
     if felt_n >= HEAVY_N:  # at the lower speed the force rises hardly faster than its running median
-        rise = Guard(name="end stop", quantity=Quantity.FORCE, limit=felt_n + END_RISE_N, axis=way.against)
+        rise = Guard(name="end stop", quantity=Quantity.FORCE, limit=felt_n + HEAVY_RISE_N, axis=way.against)
     tries = 0
     while True:
         tries += 1

@@ -52,15 +52,12 @@ class Kinematics:
         """Build the kinematics from the arm's capabilities.
 
         Raises:
-            ConfigError: the arm has other than six or seven joints, or no closed solution is known for the first six.
+            ConfigError: the arm has other than six or seven joints.
         """
         dh = np.array([[link.d_m, link.a_m, link.alpha_rad, link.offset_rad] for link in capabilities.links])
         solver = DhRobot(dh[:SOLVED_JOINTS, 2], dh[:SOLVED_JOINTS, 1], dh[:SOLVED_JOINTS, 0])
-        if len(dh) not in (SOLVED_JOINTS, SOLVED_JOINTS + 1) or not solver.hasKnownDecomposition():
-            raise ConfigError(
-                f"arm {capabilities.model!r}: no closed inverse kinematics for its {len(dh)} joints",
-                hint="use an arm of six joints with a known solution, or of seven whose first six have one",
-            )
+        if len(dh) not in (SOLVED_JOINTS, SOLVED_JOINTS + 1):
+            raise _unsolved(capabilities)
         return cls(
             capabilities=capabilities,
             dh=dh,
@@ -113,6 +110,8 @@ class Kinematics:
 
     def _solved(self, goal: Array) -> Array:
         """Return the branches (k, 6) of the first six joints for the pose (4, 4) of the frame after them."""
+        if not self.solver.hasKnownDecomposition():  # only here: without it, such an arm still moves by its joints
+            raise _unsolved(self.capabilities)
         dh = self.dh[:SOLVED_JOINTS]
         found = np.ascontiguousarray(self.solver.IK(goal).Q, float).reshape(-1, SOLVED_JOINTS)
         exact: Array = branches.exact_branches(dh, found - dh[:, 3], np.ascontiguousarray(goal))
@@ -190,3 +189,10 @@ def _fits(path: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
     low, high = np.minimum.accumulate(path), np.maximum.accumulate(path)
     turns = branches.TURN_RAD * np.ceil((lower - low) / branches.TURN_RAD - 1e-12)
     return np.asarray((high + turns <= upper + 1e-12).all(axis=1))
+
+
+def _unsolved(capabilities: ArmCapabilities) -> ConfigError:
+    return ConfigError(
+        f"arm {capabilities.model!r}: no closed inverse kinematics for its {len(capabilities.links)} joints",
+        hint="use an arm of six joints with a known solution, or of seven whose first six have one",
+    )

@@ -72,12 +72,13 @@ def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypa
     assert "temperature" not in session.world.readings
 
 
-def test_a_cap_that_looks_alike_from_afar_is_read_from_close_by(session: Session) -> None:
+def test_a_cap_that_looks_alike_from_afar_is_read_from_close_by(tmp_path: Path) -> None:
     """Views from four sides at 0.34 m do not help with a black cap in a black ring, and would take 5 s."""
-    straight = close_ups(session, ("hold",))
-    assert not straight.readings["hold"].answered
-    found = inspect.look_past(session, straight)
-    assert found.readings["hold"].state == truth_of(session, "hold").state == "pressed"
+    with open_session(load_cell(ROOT / "cells/bench.toml", seed=10), tmp_path) as session:
+        straight = close_ups(session, ("hold",))
+        assert not straight.readings["hold"].answered
+        found = inspect.look_past(session, straight)
+        assert found.readings["hold"].state == truth_of(session, "hold").state == "pressed"
     assert 1 <= len(found.pictures) - len(straight.pictures) <= len(viewpoints.CLOSE_SIDES)
     assert "close by" in found.pictures[len(straight.pictures)].title
 

@@ -90,6 +90,8 @@ def test_a_swept_line_scanner_sees_the_plate_and_the_objects_that_a_range_camera
     assert set(found[0]) == set(found[1]) == {"bypass", "emergency"}
     for name in found[0]:
         assert found[1][name].match is not None and found[1][name].off_m < 0.004
+        if found[0][name].state is None:  # not every view of a range camera shows how far a wheel is turned
+            continue
         assert found[1][name].state == pytest.approx(found[0][name].state, abs=0.002 if name == "emergency" else 0.2)
 
 

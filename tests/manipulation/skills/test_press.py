@@ -58,10 +58,13 @@ def test_a_latching_button_is_pressed_only_if_it_is_felt_to_be_otherwise(
     seen = ObjectState(name="hold", state=target)
     told = button(context, context.panel.object("hold"), target, current=seen, verify=lambda: seen)
     mover = context.mover
-    assert (told.outcome, mover.is_latched) == (Outcome.DONE, target == "pressed")
-    assert mover.presses == (is_latched != (target == "pressed"))
+    is_there = is_latched == (target == "pressed")
+    assert mover.is_latched == (target == "pressed") and mover.presses == (not is_there)
     assert told.peak_force_n > 1.0 and "felt" in told.cause
-    assert told.seen is not None and told.seen.state == target
+    if is_there:  # one height with an error of the pose is no proof
+        assert (told.outcome, told.seen) == (Outcome.UNVERIFIED, None)
+        return
+    assert told.is_done and told.seen is not None and told.seen.state == target
 
 
 @pytest.mark.parametrize("spring_n_per_m", [500.0, 1000.0, 2000.0])
@@ -97,7 +100,7 @@ def test_a_latched_mushroom_is_left_alone_and_none_is_released() -> None:
     assert isinstance(head, Mushroom)
     context = before(head, is_latched=True)
     told = mushroom(context, head, "pressed")
-    assert told.is_done and context.mover.presses == 0
+    assert told.outcome is Outcome.UNVERIFIED and context.mover.presses == 0
     assert mushroom(context, head, "released").outcome is Outcome.STALLED
     context = before(head)
     assert mushroom(context, head, "pressed").is_done and context.mover.is_latched

@@ -43,7 +43,7 @@ def ratio_to_toppra(row: Planned) -> float:
     grid, step = np.linspace(0.0, path.length_rad, POINTS, retstep=True)
     tip = timing_kernels.tip_ways(kinematics.dh, path.at(grid), flange_matrix(planner.flange_from_tool))
 
-    class Geometry(toppra.interpolator.AbstractGeometricPath):  # type: ignore[misc, name-defined]
+    class Geometry(toppra.interpolator.AbstractGeometricPath):  # type: ignore[misc, name-defined]  # toppra has no types
         dof = property(lambda _: len(limits[0]))
         path_interval = property(lambda _: np.array([0.0, path.length_rad]))
         waypoints = property(lambda _: None)

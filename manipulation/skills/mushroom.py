@@ -14,7 +14,7 @@ def mushroom(
     target: str = "pressed",
     *,
     current: ObjectState | None = None,  # noqa: ARG001 - not needed, because the head's height is felt
-    verify: Verify | None = None,  # noqa: ARG001
+    verify: Verify | None = None,  # noqa: ARG001 - not needed either
 ) -> SkillReport:
     """Press the mushroom until it is felt to be latched.
 

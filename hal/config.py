@@ -12,6 +12,7 @@ from hal.calibration import CalibrationRecord, Vector3, load_calibration
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from hal.panel import Panel, load_panel
+from hal.plant import HistorySection
 from hal.simulated_events import EventSection
 from hal.strict import Strict, load_toml
 
@@ -152,6 +153,7 @@ class CellFile(Strict):
     hand: HandSection = HandSection()
     safety: SafetySection = SafetySection()
     simulation: SimulationSection = SimulationSection()
+    history: HistorySection = HistorySection()
     emulators: dict[Name, EmulatorSection] = {}
 
     @model_validator(mode="after")

@@ -50,6 +50,7 @@ def _app() -> Callable[[], None]:
     from service.commands.doctor import doctor
     from service.commands.drivers import drivers
     from service.commands.foxglove import foxglove
+    from service.commands.history import history
     from service.commands.journal import journal
     from service.commands.learn import learn
     from service.commands.range import batch, range_image
@@ -82,6 +83,7 @@ def _app() -> Callable[[], None]:
     app.add_typer(tasks.app, name="task")
     app.command()(tasks.stop)
     app.command()(journal)
+    app.command()(history)
     app.command()(conform)
     app.command()(warm)
     app.command()(teach)

@@ -19,6 +19,8 @@ from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
+from service.history.observer import Observations
+from service.history.store import History
 from service.knowledge.calibrations import Calibrations
 from service.operations import Operation, OperationContext
 from service.processes.device_slots import IN_MOTION
@@ -74,6 +76,8 @@ class Service:
         state_dir = runs_dir / ".service"
         self._recording = None if record is None else self._record(record, inline)
         self.journal = Journal(state_dir / "journal.sqlite")
+        self.history = self._open_history(state_dir / "history")
+        self.observations = Observations(history=self.history)
         self.supervisor = Supervisor(
             cell,
             stop_listener=stop_listener,
@@ -145,7 +149,11 @@ class Service:
                 cell=self.calibrations.applied(),
                 stop=self.supervisor.stop,
             )
-            context = OperationContext(connection=connection, task=task, runs_dir=self.runs_dir, world=self.world)
+            clock = connection.clock
+            observer = self.observations.of_task(task=task.id, verb=verb, asked_by=holder or "", cell_now_s=clock.now_s)
+            context = OperationContext(
+                connection=connection, task=task, runs_dir=self.runs_dir, world=self.world, observer=observer
+            )
             with calling_as(f"{verb} {task.id}"):
                 return operation.run(context, request)
 
@@ -205,6 +213,7 @@ class Service:
         self.tasks.close()
         self.supervisor.close()
         self.note("service-end", {})
+        self.history.close()
         self.journal.close()
         if self._recording is not None:
             self._recording.close()
@@ -259,6 +268,14 @@ class Service:
         if self._recording is not None:
             self._recording.note(kind, data)
         self.journal.append(kind, data, timeout_s=COMMIT_S)
+
+    def _open_history(self, folder: Path) -> History:
+        """Open the history of readings; a damaged file is set aside, and the journal says so."""
+        cell = self.cell
+        history = History(folder, cell=cell.name, panel=cell.panel.name, bounds=cell.file.history)
+        if history.set_aside_now is not None:
+            self.note("history-set-aside", {"file": str(history.set_aside_now)})
+        return history
 
     def _record(self, path: Path, inline: bool) -> RecordingSession:
         from service.recording.session import RecordingSession

@@ -61,6 +61,12 @@ class JournalError(CellError):
     retry = Retry.AFTER_FIX
 
 
+class HistoryError(CellError):
+    """The history of readings cannot be written, so no reading may be reported; or it cannot be read."""
+
+    retry = Retry.AFTER_FIX
+
+
 class FileFault(CellError):
     """A file or folder cannot be written or read: it is missing, permission is missing, or the disk is full."""
 

@@ -27,6 +27,7 @@ STATUS: dict[type[CellError], HTTPStatus] = {
     errors.NotPossibleNow: HTTPStatus.CONFLICT,
     errors.Busy: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.JournalError: HTTPStatus.SERVICE_UNAVAILABLE,
+    errors.HistoryError: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.FileFault: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.Aborted: HTTPStatus.CONFLICT,
 }

@@ -21,6 +21,7 @@ from service.http import (
     devices,
     frames,
     health,
+    history,
     images,
     knowledge,
     missions,
@@ -89,6 +90,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         calibrations.router,
         control.router,
         missions.router,
+        history.router,
         health.router,
         stream.router,
     )

@@ -27,16 +27,18 @@ from service.schema.requests import InspectRequest, RecogniseRequest
 from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
+CROP_MARGIN_PX = 8  # round the outline of an object in its picture
 MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AnnotatedView:
-    """One image for people: RGB, uint8 (H, W, 3), with the readings drawn in; and the image that it was made from."""
+    """One image for people: RGB, uint8 (H, W, 3), with its `readings` drawn in; and the image that it was made from."""
 
     title: str
     pixels: NDArray[np.uint8]
     look: Look
+    readings: tuple[ObjectReading, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,6 +51,28 @@ class Inspection:
     readings: dict[str, ObjectReading]
     pictures: tuple[AnnotatedView, ...]
     offset_m: float = 0.0
+
+    def crops(self) -> dict[str, bytes]:
+        """Return a picture (PNG) of each object, from the last image in which it was read, else from the first."""
+        shown: dict[str, bytes] = {}
+        for picture in self.pictures:
+            for reading in picture.readings:
+                cut = _cut_out(picture.look.pixels, reading)
+                if cut is not None and (reading.name not in shown or reading.answered):
+                    shown[reading.name] = png_of(cut)
+        return shown
+
+
+def _cut_out(pixels: NDArray[np.uint8], reading: ObjectReading) -> NDArray[np.uint8] | None:
+    """Return the part of an image with the object's outline and a margin; None when it lies outside of the image."""
+    if len(reading.outline_px) == 0 or not np.isfinite(reading.outline_px).all():
+        return None
+    low = np.floor(reading.outline_px.min(axis=0)).astype(int) - CROP_MARGIN_PX
+    high = np.ceil(reading.outline_px.max(axis=0)).astype(int) + CROP_MARGIN_PX
+    height, width = pixels.shape[:2]
+    left, right = (int(np.clip(u, 0, width)) for u in (low[0], high[0]))
+    top, bottom = (int(np.clip(v, 0, height)) for v in (low[1], high[1]))
+    return pixels[top:bottom, left:right] if left < right and top < bottom else None
 
 
 def inspect_here(
@@ -75,7 +99,8 @@ def inspect_here(
         look(session, view.camera)  # raises if the camera is frozen, which a second identical frame shows
         raise
     session.world.note_readings(readings)
-    picture = AnnotatedView(title=title, pixels=draw_annotated(view.pixels, readings), look=view)
+    drawn = draw_annotated(view.pixels, readings)
+    picture = AnnotatedView(title=title, pixels=drawn, look=view, readings=tuple(readings))
     off_m = offset_m(view, readings, session.known_panel().parent_from_child, session.panel)
     return Inspection(readings={r.name: r for r in readings}, pictures=(picture,), offset_m=off_m)
 
@@ -263,6 +288,7 @@ def need_all_present(found: Inspection, session: Session) -> None:
 
 def _answer(session: Session, found: Inspection, least_confidence: float) -> InspectResult:
     """Return the answer at the caller's least confidence; stored readings and pictures keep the default."""
+    session.observer.saw(found.readings.values(), found.crops())
     readings = [answer_at(reading, least_confidence) for reading in found.readings.values()]
     pictures = [
         session.context.task.artefact(f"annotated-{k}.png", png_of(picture.pixels), "image/png")

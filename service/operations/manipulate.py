@@ -55,6 +55,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     free_hand(skill_context(session))
     eye = _Eye(session, panel_object, verify)
     before, findings = _look_first(session, eye, panel_object)
+    session.observer.told(eye.witness.name, text_of(panel_object, target))
     report = _operate(session, eye, panel_object, target, before)
     if not report.is_done or eye.is_off_its_place:
         report, found = _after_doubt(session, eye, panel_object, target, report)
@@ -247,6 +248,7 @@ class _Eye:
         self.picture: Picture | None = None
         self.is_off_its_place = False  # the last look did not show the panel where its pose has it
         self.is_missing = False  # the last look did not show the witness
+        self._at = f"before {panel_object.name}"  # which part of the work a look belongs to
 
     def before(self, *, is_fresh: bool) -> ObjectReading | None:
         """Return what the witness shows before the action: the newest reading, or a new one if wanted or needed."""
@@ -266,6 +268,7 @@ class _Eye:
 
     def _verify(self) -> ObjectState | None:
         self.forget()
+        self._at = f"after {self._panel_object.name}"
         self.last = self._look()
         return None if self.last is None else object_state(self.last, self.witness)
 
@@ -287,6 +290,9 @@ class _Eye:
             png=png_of(found.pictures[-1].pixels),
         )
         reading = found.readings[self.witness.name]
+        record = self._session.record
+        mission = "" if record is None else record.mission
+        self._session.observer.saw([reading], found.crops(), mission=mission, phase=self._at)
         return reading if reading.present and reading.answered else None
 
 

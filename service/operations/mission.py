@@ -136,6 +136,7 @@ def _run(session: Session, record: MissionRecord, request: MissionRequest) -> No
     with _step(session, "read", 0.22, 0.38) as part:
         read = inspect_close(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, read, "read")
+        part.observer.saw(read.readings.values(), read.crops(), mission=record.mission, phase=BEFORE)
         record.readings += [reading_result(reading, BEFORE) for reading in read.readings.values()]
         rims = rims_in(part, [view.look for view in (*overview.pictures, *read.pictures)])
     with _step(session, "touch", 0.38, 0.55) as part:

@@ -15,6 +15,7 @@ from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
 from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
+from service.history.observer import NoObserver, Observer
 from service.processes.connection import CellConnection
 from service.report.record import MissionRecord
 from service.schema.requests import InspectRequest, RecogniseRequest
@@ -24,12 +25,13 @@ from service.world_model import WorldModel, expected_panel
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OperationContext:
-    """The inputs of every operation; missions write their reports into `runs_dir`."""
+    """The inputs of every operation; missions write their reports into `runs_dir`; `observer` keeps what is read."""
 
     connection: CellConnection
     task: TaskContext
     runs_dir: Path
     world: WorldModel = field(default_factory=WorldModel)
+    observer: Observer = field(default_factory=NoObserver)
 
 
 class NotedMover:
@@ -97,6 +99,11 @@ class Session:
     def world(self) -> WorldModel:
         """The facts that the cell has measured so far."""
         return self.context.world
+
+    @property
+    def observer(self) -> Observer:
+        """What keeps the readings."""
+        return self.context.observer
 
     def progress(self, fraction: float, step: str, detail: str = "") -> None:
         """Report the progress of this operation, 0 to 1.

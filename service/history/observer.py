@@ -1,0 +1,107 @@
+"""Takes the readings of one task to everything that keeps them, before the task reports them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+from service.history.reading import StoredReading, answer_of
+from service.history.store import History
+
+if TYPE_CHECKING:
+    from perception.vision import ObjectReading
+
+
+class Observer(Protocol):
+    """What an operation tells about the objects that it reads and operates."""
+
+    def saw(
+        self, readings: Iterable[ObjectReading], crops: Mapping[str, bytes], *, mission: str = "", phase: str = ""
+    ) -> None:
+        """Keep the readings; they are durable when this returns, and may be reported.
+
+        Args:
+            crops: PNG picture of each object, by its name.
+            mission: name of the mission's report.
+            phase: part of the work, such as `before the actions`.
+
+        Raises:
+            HistoryError: they could not be stored.
+        """
+        ...
+
+    def told(self, name: str, target: str) -> None:
+        """Note what an object is now told to be."""
+        ...
+
+
+class NoObserver:
+    """Keeps nothing, for operations outside of a service."""
+
+    def saw(
+        self, readings: Iterable[ObjectReading], crops: Mapping[str, bytes], *, mission: str = "", phase: str = ""
+    ) -> None:
+        """Drop the readings."""
+
+    def told(self, name: str, target: str) -> None:
+        """Drop the target."""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Observations:
+    """The history of a cell with those that listen to it.
+
+    Attributes:
+        listeners: called with readings after they were stored, for example to raise alarms.
+        targets: what each object was last told to be.
+    """
+
+    history: History
+    listeners: list[Callable[[Sequence[StoredReading]], None]] = field(default_factory=list)
+    targets: dict[str, str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.targets = self.history.told()
+
+    def of_task(self, *, task: str, verb: str, asked_by: str, cell_now_s: Callable[[], float]) -> TaskObserver:
+        """Return the observer of one task."""
+        return TaskObserver(self, task=task, verb=verb, asked_by=asked_by, cell_now_s=cell_now_s)
+
+
+class TaskObserver:
+    """Stores the readings of one task with its circumstances; see `Observer`."""
+
+    def __init__(
+        self, kept: Observations, *, task: str, verb: str, asked_by: str, cell_now_s: Callable[[], float]
+    ) -> None:
+        self._kept = kept
+        self._by = {"task": task, "verb": verb, "asked_by": asked_by}
+        self._cell_now_s = cell_now_s
+
+    def saw(
+        self, readings: Iterable[ObjectReading], crops: Mapping[str, bytes], *, mission: str = "", phase: str = ""
+    ) -> None:
+        """Store the readings, then let the listeners see them; see `Observer.saw`."""
+        utc_s, cell_s = time.time(), self._cell_now_s()
+        stored = [
+            StoredReading(
+                **answer_of(reading),
+                **self._by,
+                utc_s=utc_s,
+                cell_s=cell_s,
+                mission=mission,
+                phase=phase,
+                told=self._kept.targets.get(reading.name),
+                crop=self._kept.history.crops.add(crops[reading.name]) if reading.name in crops else None,
+            )
+            for reading in readings
+        ]
+        self._kept.history.add(stored)
+        for listen in self._kept.listeners:
+            listen(stored)
+
+    def told(self, name: str, target: str) -> None:
+        """Note what an object is now told to be; its next reading says so."""
+        self._kept.targets[name] = target

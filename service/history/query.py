@@ -1,0 +1,210 @@
+"""Answers questions about the history: pages of readings, trends in buckets of time, and the newest of each object."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.errors import HistoryError
+from service.history.parts import ids_of, parts_of, read_parts
+from service.history.reading import COLUMNS, INVALID, StoredReading
+
+MOST_ROWS = 1000
+SELECTED = f"id, {', '.join(COLUMNS)}"
+BATCH = 2000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Query:
+    """Readings that are asked for.
+
+    Attributes:
+        object: name of the object; None for all.
+        since_s, until_s: first and last moment, seconds since 1970; None for no bound.
+    """
+
+    cell: str
+    object: str | None = None
+    since_s: float | None = None
+    until_s: float | None = None
+
+    def where(self, *more: str) -> tuple[str, list[Any]]:
+        """Return the condition in SQL, with its values."""
+        terms, values = ["cell = ?"], list[Any]([self.cell])
+        for term, value in (("object = ?", self.object), ("utc_s >= ?", self.since_s), ("utc_s <= ?", self.until_s)):
+            if value is not None:
+                terms.append(term)
+                values.append(value)
+        return f"WHERE {' AND '.join([*terms, *more])}", values
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A stored reading and its number, which rises by time of storing."""
+
+    id: int
+    reading: StoredReading
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bucket:
+    """What was read in one span of time.
+
+    Attributes:
+        since_s, until_s: the span, seconds since 1970.
+        count: readings in it; `refused` of them were invalid and count in nothing else.
+        minimum, maximum, mean: of the valid values; None without any.
+        states: how often each state or text was read.
+    """
+
+    since_s: float
+    until_s: float
+    count: int
+    refused: int
+    minimum: float | None
+    maximum: float | None
+    mean: float | None
+    states: dict[str, int]
+
+
+class Reader:
+    """Reads the database and the Parquet parts as one history.
+
+    Args:
+        path: the SQLite file.
+        parts: folder of the Parquet parts.
+    """
+
+    def __init__(self, path: Path, parts: Path) -> None:
+        self._path = path
+        self._parts = parts
+
+    def page(self, query: Query, *, after: int = 0, limit: int = MOST_ROWS) -> list[Row]:
+        """Return at most `limit` readings with an id above `after`, in the order in which they were stored.
+
+        Raises:
+            HistoryError: the file cannot be read.
+            Unsupported: the readings are in Parquet parts, and DuckDB is not installed.
+        """
+        where, values = query.where("id > ?")
+        tail = f"{where} ORDER BY id LIMIT {int(limit)}"
+        with self._open() as db:
+            rows = read_parts(self._older(db, after=after), SELECTED, tail, [*values, after])
+            if len(rows) < limit:
+                live = f"SELECT {SELECTED} FROM readings {where} ORDER BY id LIMIT ?"
+                rows += db.execute(live, [*values, after, limit - len(rows)]).fetchall()
+        return [_row(row) for row in rows]
+
+    def all(self, query: Query) -> Iterator[Row]:
+        """Yield all readings, in pages, so that writing is never held up."""
+        after = 0
+        while page := self.page(query, after=after, limit=BATCH):
+            yield from page
+            after = page[-1].id
+
+    def trend(self, query: Query, *, buckets: int) -> list[Bucket]:
+        """Return the readings of one object down-sampled to at most `buckets` spans of equal length; empty spans are left out.
+
+        Raises:
+            HistoryError, Unsupported: as for `page`.
+        """
+        with self._open() as db:
+            older = self._older(db)
+            first_s, last_s = self._span(db, older, query)
+            if first_s is None or last_s is None:
+                return []
+            since_s = first_s if query.since_s is None else query.since_s
+            until_s = last_s if query.until_s is None else query.until_s
+            width_s = max((until_s - since_s) / buckets, 1e-3)
+            place = f"(utc_s - {since_s!r}) / {width_s!r}"
+            where, values = query.where()
+            sums = _sums(f"MIN(CAST({place} AS INTEGER), {buckets - 1})")
+            found = db.execute(f"SELECT {sums} FROM readings {where} GROUP BY 1, 2", values).fetchall()
+            sums = _sums(
+                f"CAST(LEAST(FLOOR({place}), {buckets - 1}) AS INTEGER)"
+            )  # DuckDB rounds where SQLite cuts off
+            found += read_parts(older, sums, f"{where} GROUP BY 1, 2", values)
+        return _merged(found, since_s, width_s)
+
+    def newest(self, cell: str) -> list[Row]:
+        """Return the newest reading of each object of the database."""
+        chosen = "SELECT MAX(id) FROM readings WHERE cell = ? GROUP BY object"
+        with self._open() as db:
+            rows = db.execute(
+                f"SELECT {SELECTED} FROM readings WHERE id IN ({chosen}) ORDER BY object", (cell,)
+            ).fetchall()
+        return [_row(row) for row in rows]
+
+    def told(self, cell: str) -> dict[str, str]:
+        """Return what each object was told to be when it was read last."""
+        return {row.reading.object: row.reading.told for row in self.newest(cell) if row.reading.told is not None}
+
+    def _span(self, db: sqlite3.Connection, older: Sequence[Path], query: Query) -> tuple[float | None, float | None]:
+        where, values = query.where()
+        spans = db.execute(f"SELECT MIN(utc_s), MAX(utc_s) FROM readings {where}", values).fetchall()
+        spans += read_parts(older, "MIN(utc_s), MAX(utc_s)", where, values)
+        known = [(low, high) for low, high in spans if low is not None]
+        return (min(low for low, _ in known), max(high for _, high in known)) if known else (None, None)
+
+    def _older(self, db: sqlite3.Connection, *, after: int = 0) -> list[Path]:
+        """Return the parts with readings above `after` that are not in the database any more."""
+        first = db.execute("SELECT MIN(id) FROM readings").fetchone()[0]
+        ids = [(part, *ids_of(part)) for part in parts_of(self._parts)]
+        return [part for part, _, last in ids if last > after and (first is None or last < first)]
+
+    def _open(self) -> closing[sqlite3.Connection]:
+        uri = f"{self._path.absolute().as_uri()}?mode=ro"
+        try:
+            db = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=5.0)
+            db.execute("BEGIN")  # one snapshot for the whole answer
+            db.execute("SELECT 1 FROM readings LIMIT 1").fetchone()
+        except sqlite3.Error as error:
+            raise HistoryError(
+                f"the history {self._path} cannot be read: {error}",
+                hint="see the service's log; a damaged file is set aside at the next start",
+            ) from error
+        return closing(db)
+
+
+def _sums(number: str) -> str:
+    """Return the columns of a trend: bucket, what was shown in words, counts, extremes and sum of the values."""
+    return (
+        f"{number}, CASE WHEN value IS NULL THEN COALESCE(state, text) END, COUNT(*), "
+        f"SUM(CASE WHEN quality = '{INVALID}' THEN 1 ELSE 0 END), MIN(value), MAX(value), SUM(value), COUNT(value)"
+    )
+
+
+def _merged(found: Sequence[tuple[Any, ...]], since_s: float, width_s: float) -> list[Bucket]:
+    """Join the sums of database and parts, bucket by bucket."""
+    by_number: dict[int, list[tuple[Any, ...]]] = {}
+    for number, *sums in found:
+        by_number.setdefault(int(number), []).append(tuple(sums))
+    buckets: list[Bucket] = []
+    for number, rows in sorted(by_number.items()):
+        values = [row for row in rows if row[6]]
+        count = sum(row[6] for row in values)
+        states: dict[str, int] = {}
+        for row in rows:
+            if row[0] is not None:
+                states[row[0]] = states.get(row[0], 0) + int(row[1])
+        buckets.append(
+            Bucket(
+                since_s=since_s + number * width_s,
+                until_s=since_s + (number + 1) * width_s,
+                count=sum(int(row[1]) for row in rows),
+                refused=sum(int(row[2]) for row in rows),
+                minimum=min((row[3] for row in values), default=None),
+                maximum=max((row[4] for row in values), default=None),
+                mean=sum(row[5] for row in values) / count if count else None,
+                states=states,
+            )
+        )
+    return buckets
+
+
+def _row(row: Sequence[Any]) -> Row:
+    return Row(id=int(row[0]), reading=StoredReading(**dict(zip(COLUMNS, row[1:], strict=True))))

@@ -1,0 +1,215 @@
+"""`/v1/history`: the readings of every object over time, as pages, trends and files."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Query
+from pydantic import BaseModel, Field
+from starlette.background import BackgroundTask
+from starlette.responses import FileResponse, Response, StreamingResponse
+
+from hal.errors import InvalidRequest
+from service.errors import NoSuchTask
+from service.history.parts import write_parquet
+from service.history.query import Query as Question
+from service.history.query import Row
+from service.history.reading import COLUMNS
+from service.http.problems import RESPONSES
+from service.http.state import AppState, State
+
+router = APIRouter(prefix="/v1/history", tags=["history"], responses=RESPONSES)
+ObjectName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,40}$", examples=["pressure"])]
+Moment = Annotated[float | None, Query(ge=0.0, le=1e11, allow_inf_nan=False, description="seconds since 1970")]
+HEAD = ("id", *COLUMNS)
+
+
+class HistoryReading(BaseModel):
+    """A stored reading. `quality` is `valid` or `invalid`; an invalid one has a `cause` and no value, state or text.
+
+    `sigma` is the standard deviation of `value`, `told` what the object was last told to be, `crop_url` its picture.
+    """
+
+    id: int
+    object: str
+    kind: str
+    utc_s: Annotated[float, Field(description="seconds since 1970")]
+    cell_s: Annotated[float, Field(description="the same moment on the cell's clock")]
+    quality: str
+    cause: str
+    value: float | None
+    unit: str
+    sigma: float | None
+    state: str | None
+    text: str | None
+    confidence: float
+    guess: Annotated[str | None, Field(description="JSON: what an invalid reading withholds, and its rivals")]
+    verb: str
+    task: str
+    mission: str
+    asked_by: str
+    phase: str
+    told: str | None
+    crop_url: str | None
+
+
+class BucketView(BaseModel):
+    """What was read in one span of time; refused readings are counted and go into nothing else."""
+
+    since_s: float
+    until_s: float
+    count: int
+    refused: int
+    minimum: float | None
+    maximum: float | None
+    mean: float | None
+    states: dict[str, int]
+
+
+class HistoryPage(BaseModel):
+    """Readings in the order in which they were stored, or `buckets` if they were asked for.
+
+    `next_after` is what to send as `after` for the next page; null on the last one.
+    """
+
+    object: str
+    readings: list[HistoryReading] = []
+    buckets: list[BucketView] = []
+    next_after: int | None = None
+
+
+class HistoryOverview(BaseModel):
+    """The newest reading of each object, and the damaged files that were set aside."""
+
+    newest: list[HistoryReading]
+    set_aside: list[str]
+
+
+@router.get("", summary="Newest reading of each object", operation_id="history_overview")
+async def history_overview(state: State) -> HistoryOverview:
+    history, cell = state.service.history, state.service.cell.name
+    rows = await state.in_thread(lambda: history.reader().newest(cell))
+    return HistoryOverview(newest=[_view(row) for row in rows], set_aside=[path.name for path in history.set_aside])
+
+
+@router.get(
+    "/export",
+    summary="Readings as a file: CSV, or Parquet with the extra `history`",
+    operation_id="export_history",
+    response_class=Response,
+    responses={200: {"content": {"text/csv": {}, "application/vnd.apache.parquet": {}}}},
+)
+async def export_history(
+    state: State,
+    format: Literal["csv", "parquet"] = "csv",
+    object: Annotated[str | None, Query(pattern=r"^[a-z][a-z0-9_]{0,40}$")] = None,
+    since_s: Moment = None,
+    until_s: Moment = None,
+) -> Response:
+    question = _question(state, object, since_s, until_s)
+    if format == "csv":
+        headers = {"Content-Disposition": "attachment; filename=history.csv"}
+        lines = state.service.history.reader().all(question)
+        first = await state.in_thread(
+            lambda: next(lines, None)
+        )  # a file that cannot be read is an error, not half an answer
+        return StreamingResponse(_csv(first, lines), media_type="text/csv; charset=utf-8", headers=headers)
+    path = await state.in_thread(functools.partial(_parquet, state, question))
+    return FileResponse(
+        path,
+        media_type="application/vnd.apache.parquet",
+        filename="history.parquet",
+        background=BackgroundTask(lambda: path.unlink(missing_ok=True)),
+    )
+
+
+@router.get("/{object}", summary="Readings of one object: pages, or a trend", operation_id="show_history")
+async def show_history(
+    state: State,
+    object: ObjectName,
+    since_s: Moment = None,
+    until_s: Moment = None,
+    after: Annotated[int, Query(ge=0, lt=2**62, description="only readings with a larger id")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000, description="most readings of one page")] = 200,
+    buckets: Annotated[
+        int, Query(ge=0, le=2000, description="0: readings. Otherwise least, greatest and mean value of so many spans")
+    ] = 0,
+) -> HistoryPage:
+    question = _question(state, object, since_s, until_s)
+    reader = state.service.history.reader()
+    if buckets:
+        found = await state.in_thread(functools.partial(reader.trend, question, buckets=buckets))
+        return HistoryPage(object=object, buckets=[BucketView(**asdict(bucket)) for bucket in found])
+    rows = await state.in_thread(functools.partial(reader.page, question, after=after, limit=limit))
+    return HistoryPage(
+        object=object,
+        readings=[_view(row) for row in rows],
+        next_after=rows[-1].id if len(rows) == limit else None,
+    )
+
+
+@router.get(
+    "/{object}/crops/{crop}",
+    summary="The picture of an object at a reading",
+    operation_id="fetch_crop",
+    response_class=FileResponse,
+    responses={200: {"content": {"image/png": {}}}},
+)
+async def fetch_crop(
+    state: State, object: ObjectName, crop: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
+) -> FileResponse:
+    path = await state.in_thread(lambda: state.service.history.crops.path(crop))
+    if path is None:
+        raise NoSuchTask("there is no such picture, or it is not kept any more", hint=f"GET /v1/history/{object}")
+    return FileResponse(path, media_type="image/png")
+
+
+def _question(state: AppState, name: str | None, since_s: float | None, until_s: float | None) -> Question:
+    if since_s is not None and until_s is not None and until_s < since_s:
+        raise InvalidRequest("query.until_s: ends before since_s", hint="swap them")
+    return state.service.history.ask(object=name, since_s=since_s, until_s=until_s)
+
+
+def _view(row: Row) -> HistoryReading:
+    plain = asdict(row.reading)
+    crop = plain.pop("crop")
+    url = None if crop is None else f"/v1/history/{row.reading.object}/crops/{crop}"
+    return HistoryReading(id=row.id, crop_url=url, **plain)
+
+
+def _csv(first: Row | None, lines: Iterator[Row]) -> Iterator[str]:
+    """Yield a CSV file in pieces, with a line of names first."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(HEAD)
+    row = first
+    while row is not None:
+        writer.writerow(_cells(row))
+        if text.tell() > 60_000:
+            yield text.getvalue()
+            text.seek(0)
+            text.truncate()
+        row = next(lines, None)
+    yield text.getvalue()
+
+
+def _cells(row: Row) -> list[Any]:
+    return [row.id, *asdict(row.reading).values()]
+
+
+def _parquet(state: AppState, question: Question) -> FilePath:
+    with tempfile.NamedTemporaryFile(suffix=".parquet", delete=False) as file:
+        path = FilePath(file.name)
+    try:
+        write_parquet(path, HEAD, (_cells(row) for row in state.service.history.reader().all(question)))
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+    return path

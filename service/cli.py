@@ -43,7 +43,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import calibrate, devices, init, tasks
+    from service.commands import alarms, calibrate, devices, init, tasks
     from service.commands.check import check
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
@@ -84,6 +84,7 @@ def _app() -> Callable[[], None]:
     app.command()(tasks.stop)
     app.command()(journal)
     app.command()(history)
+    app.add_typer(alarms.app, name="alarms")
     app.command()(conform)
     app.command()(warm)
     app.command()(teach)

@@ -17,6 +17,7 @@ from pydantic import BaseModel
 from hal.caller import calling_as
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
+from service.alarms.desk import AlarmDesk
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.history.observer import Observations
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 
 RESTORED_TASKS = 100
 LOOK_S = 0.05
+ALARMS_S = 1.0
+RESTORED_ALARMS = 1000
 COMMIT_S = 2.0  # an answer waits no longer for a slow disk
 log = logging.getLogger(__name__)
 
@@ -77,7 +80,8 @@ class Service:
         self._recording = None if record is None else self._record(record, inline)
         self.journal = Journal(state_dir / "journal.sqlite")
         self.history = self._open_history(state_dir / "history")
-        self.observations = Observations(history=self.history)
+        self.alarms = self._open_alarms(state_dir / "alarms.json")
+        self.observations = Observations(history=self.history, listeners=[self.alarms.take])
         self.supervisor = Supervisor(
             cell,
             stop_listener=stop_listener,
@@ -115,6 +119,7 @@ class Service:
         """
         self.note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
+        threading.Thread(target=self._tend_alarms, name="alarms", daemon=True).start()
         self.supervisor.start()
 
     def submit(self, verb: str, request: BaseModel, *, lease_token: str | None = None, key: str | None = None) -> Task:
@@ -250,6 +255,11 @@ class Service:
             self.lease.expire()
             self.supervisor.note_stop()
 
+    def _tend_alarms(self) -> None:
+        """Let the alarms' time pass, in a thread of its own because each change waits for the disk."""
+        while not self._is_closing.wait(ALARMS_S):
+            self.alarms.tick()
+
     def note(self, kind: str, data: dict[str, Any]) -> None:
         """Write an entry to the journal without waiting for the disk."""
         if self._recording is not None:
@@ -276,6 +286,16 @@ class Service:
         if history.set_aside_now is not None:
             self.note("history-set-aside", {"file": str(history.set_aside_now)})
         return history
+
+    def _open_alarms(self, path: Path) -> AlarmDesk:
+        reader, names = self.history.reader(), [one.name for one in self.cell.panel.objects]
+        return AlarmDesk(
+            self.cell.panel,
+            path=path,
+            commit=self.commit,
+            recorded=[record.data for record in self.journal.records(kinds=("alarm",), limit=RESTORED_ALARMS)],
+            valid_at_s=reader.valid_at_s(self.cell.name, names),
+        )
 
     def _record(self, path: Path, inline: bool) -> RecordingSession:
         from service.recording.session import RecordingSession

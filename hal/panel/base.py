@@ -8,11 +8,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
+from pydantic import Field, ValidationError, model_validator
+
+from hal.panel.angles import fault
 from hal.panel.form import Envelope, Face, Relief, Rim
 from hal.panel.goals import GAUGE_SHARE, Goal, Shown
-from hal.panel.parts import Name, Vector2, Vector3
+from hal.panel.limits import Limits, Priority
+from hal.panel.parts import Name, Positive, Vector2, Vector3
 from hal.panel.questions import Question, Taught
 from hal.strict import Strict
 
@@ -24,6 +28,15 @@ class PanelObject(Strict, ABC):
     name: Name
     label: str = ""
     position_m: Vector2
+    limits: Annotated[Limits | None, Field(description="of its value; beyond them an alarm is raised")] = None
+    normal: Annotated[
+        tuple[str, ...] | None, Field(min_length=1, description="its normal states; any other raises an alarm")
+    ] = None
+    stale_after_s: Annotated[
+        Positive | None, Field(description="age of its newest valid reading from which an alarm is raised")
+    ] = None
+    priority: Annotated[Priority, Field(description="of its alarms")] = "medium"
+    what_to_do: Annotated[str, Field(max_length=500, description="shown with its alarms")] = ""
 
     value_is_angle: ClassVar[bool] = False
     """Whether a value of the object is an angle in radians rather than a value of a scale."""
@@ -39,6 +52,27 @@ class PanelObject(Strict, ABC):
     """Whether the positions on its scale are lengths in metres rather than angles."""
     turns_about_click: ClassVar[bool] = False
     """Whether teaching uses the clicked point as its centre, rather than the centre of its outline."""
+
+    @model_validator(mode="after")
+    def _its_alarms_can_be_meant(self) -> PanelObject:
+        states, faults = self.states_shown, []
+        if self.limits is not None and states:
+            hint = f"write normal = [...] with some of its states: {', '.join(states)}"
+            faults.append(fault(("limits",), self.name, f"a {self.kind} shows states and no value", hint))
+        if self.normal is not None and not states and (self.full_scale is not None or self.value_is_angle):
+            faults.append(fault(("normal",), self.name, f"a {self.kind} shows a value and no state", "write limits"))
+        for k, state in enumerate(self.normal or ()):
+            if states and state not in states:
+                hint = f"its states: {', '.join(states)}"
+                faults.append(fault(("normal", k), state, f"{self.name} has no state {state!r}", hint))
+        if faults:
+            raise ValidationError.from_exception_data(self.name, faults)
+        return self
+
+    @property
+    def states_shown(self) -> tuple[str, ...]:
+        """States that a look can tell apart; empty for an object that shows a value."""
+        return tuple(self.resting_angles)
 
     @property
     def point_m(self) -> Vector3:

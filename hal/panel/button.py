@@ -32,6 +32,11 @@ class Button(Round):
     )
 
     @property
+    def states_shown(self) -> tuple[str, ...]:
+        """States that a look can tell apart."""
+        return "pressed", "released"
+
+    @property
     def pressed_depth_m(self) -> float:
         """Depth below the released cap at which it is read as pressed, that is, held down or latched."""
         return LATCHED_SHARE * self.travel_m if self.latching else self.travel_m

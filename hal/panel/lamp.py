@@ -24,6 +24,11 @@ class Lamp(Round):
     )
 
     @property
+    def states_shown(self) -> tuple[str, ...]:
+        """States that a look can tell apart."""
+        return "on", "off"
+
+    @property
     def rim(self) -> Rim:
         """The foot of the lens; what is seen lies anywhere from there to its front."""
         return circle(self.radius_m, above_sigma_m=self.height_m / math.sqrt(3.0))

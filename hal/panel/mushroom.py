@@ -23,6 +23,11 @@ class Mushroom(Round):
     is_round: ClassVar[bool] = True
 
     @property
+    def states_shown(self) -> tuple[str, ...]:
+        """States that a look can tell apart."""
+        return "pressed", "released"
+
+    @property
     def pressed_depth_m(self) -> float:
         """Depth of a latched head below a released one."""
         return LATCHED_SHARE * self.travel_m

@@ -23,6 +23,11 @@ class Toggle(PanelObject):
     force_n: Positive = 6.0
 
     @property
+    def states_shown(self) -> tuple[str, ...]:
+        """States that a look can tell apart."""
+        return "on", "off"
+
+    @property
     def face(self) -> Face:
         """Nut and bat, which leans out of it; the height is that of its tip."""
         reach = self.bat_length_m * math.sin(self.tilt_rad) + self.bat_radius_m

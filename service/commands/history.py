@@ -6,7 +6,7 @@ import re
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 from urllib.parse import urlencode
 
 import typer
@@ -16,9 +16,6 @@ from rich.table import Table
 from hal.errors import InvalidRequest
 from service.client import Client
 from service.commands.common import Url, UrlDefault, client_of, console
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SPAN = re.compile(r"(\d+(?:\.\d+)?)([smhdw])")
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
@@ -103,7 +100,7 @@ def drawn(name: str, trend: list[dict[str, Any]], *, unit: str) -> bytes:
     from service.report.plots import figure_png, sheet
 
     figure = sheet(3.4)
-    axes = figure.subplots()
+    axes: Any = figure.subplots()  # matplotlib takes times, but its annotations do not say so
     moments = [datetime.fromtimestamp((one["since_s"] + one["until_s"]) / 2, UTC) for one in trend]
     if any(one["mean"] is not None for one in trend):
         _draw_values(axes, moments, trend)
@@ -119,7 +116,7 @@ def drawn(name: str, trend: list[dict[str, Any]], *, unit: str) -> bytes:
     return figure_png(figure)
 
 
-def _draw_values(axes: Axes, moments: list[datetime], trend: list[dict[str, Any]]) -> None:
+def _draw_values(axes: Any, moments: list[datetime], trend: list[dict[str, Any]]) -> None:
     known = [(moment, one) for moment, one in zip(moments, trend, strict=True) if one["mean"] is not None]
     when = [moment for moment, _ in known]
     axes.fill_between(

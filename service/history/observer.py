@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from service.history.reading import StoredReading, answer_of
 from service.history.store import History
@@ -77,7 +77,7 @@ class TaskObserver:
         self, kept: Observations, *, task: str, verb: str, asked_by: str, cell_now_s: Callable[[], float]
     ) -> None:
         self._kept = kept
-        self._by = {"task": task, "verb": verb, "asked_by": asked_by}
+        self._by: dict[str, Any] = {"task": task, "verb": verb, "asked_by": asked_by}
         self._cell_now_s = cell_now_s
 
     def saw(

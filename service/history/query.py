@@ -11,7 +11,7 @@ from typing import Any
 
 from service.errors import HistoryError
 from service.history.parts import ids_of, parts_of, read_parts
-from service.history.reading import COLUMNS, INVALID, StoredReading
+from service.history.reading import COLUMNS, INVALID, VALID, StoredReading
 
 MOST_ROWS = 1000
 SELECTED = f"id, {', '.join(COLUMNS)}"
@@ -142,6 +142,13 @@ class Reader:
     def told(self, cell: str) -> dict[str, str]:
         """Return what each object was told to be when it was read last."""
         return {row.reading.object: row.reading.told for row in self.newest(cell) if row.reading.told is not None}
+
+    def valid_at_s(self, cell: str, names: Sequence[str]) -> dict[str, float]:
+        """Return when each of the objects was read validly last, seconds since 1970."""
+        newest = "SELECT utc_s FROM readings WHERE cell = ? AND object = ? AND quality = ? ORDER BY utc_s DESC LIMIT 1"
+        with self._open() as db:
+            found = {name: db.execute(newest, (cell, name, VALID)).fetchone() for name in names}
+        return {name: float(row[0]) for name, row in found.items() if row is not None}
 
     def _span(self, db: sqlite3.Connection, older: Sequence[Path], query: Query) -> tuple[float | None, float | None]:
         where, values = query.where()

@@ -16,6 +16,7 @@ from starlette.types import ASGIApp
 
 from service.core import Service
 from service.http import (
+    alarms,
     calibrations,
     control,
     devices,
@@ -91,6 +92,7 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         control.router,
         missions.router,
         history.router,
+        alarms.router,
         health.router,
         stream.router,
     )
@@ -135,6 +137,7 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         SwapRequest,
         OutlineRequest,
         TeachRequest,
+        *alarms.BODIES,
         Problem,
     ]
     _, extra = models_json_schema(

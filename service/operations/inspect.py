@@ -21,13 +21,12 @@ from service.operations.locate import go_to_overview, locate_from_overview, offs
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
-from service.report.plots import png_of
+from service.report.plots import cut_out, png_of
 from service.schema.mission_results import ReadingResult
 from service.schema.requests import InspectRequest, RecogniseRequest
 from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
-CROP_MARGIN_PX = 8  # round the outline of an object in its picture
 MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
@@ -57,22 +56,10 @@ class Inspection:
         shown: dict[str, bytes] = {}
         for picture in self.pictures:
             for reading in picture.readings:
-                cut = _cut_out(picture.look.pixels, reading)
+                cut = cut_out(picture.look.pixels, reading.outline_px)
                 if cut is not None and (reading.name not in shown or reading.answered):
                     shown[reading.name] = png_of(cut)
         return shown
-
-
-def _cut_out(pixels: NDArray[np.uint8], reading: ObjectReading) -> NDArray[np.uint8] | None:
-    """Return the part of an image with the object's outline and a margin; None when it lies outside of the image."""
-    if len(reading.outline_px) == 0 or not np.isfinite(reading.outline_px).all():
-        return None
-    low = np.floor(reading.outline_px.min(axis=0)).astype(int) - CROP_MARGIN_PX
-    high = np.ceil(reading.outline_px.max(axis=0)).astype(int) + CROP_MARGIN_PX
-    height, width = pixels.shape[:2]
-    left, right = (int(np.clip(u, 0, width)) for u in (low[0], high[0]))
-    top, bottom = (int(np.clip(v, 0, height)) for v in (low[1], high[1]))
-    return pixels[top:bottom, left:right] if left < right and top < bottom else None
 
 
 def inspect_here(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Pixels = NDArray[np.uint8]
 INK, SOFT = "#1c2733", "#5a6b7b"
 MAX_PLOT_POINTS = 4000
+CROP_MARGIN_PX = 8
 
 
 def png_of(pixels: Pixels) -> bytes:
@@ -25,6 +26,18 @@ def png_of(pixels: Pixels) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "PNG")
     return stream.getvalue()
+
+
+def cut_out(pixels: Pixels, outline_px: NDArray[Any]) -> Pixels | None:
+    """Return the part of an image with an outline, px (N, 2), and a margin; None when it lies outside of the image."""
+    if len(outline_px) == 0 or not np.isfinite(outline_px).all():
+        return None
+    low = np.floor(outline_px.min(axis=0)).astype(int) - CROP_MARGIN_PX
+    high = np.ceil(outline_px.max(axis=0)).astype(int) + CROP_MARGIN_PX
+    height, width = pixels.shape[:2]
+    left, right = (int(np.clip(u, 0, width)) for u in (low[0], high[0]))
+    top, bottom = (int(np.clip(v, 0, height)) for v in (low[1], high[1]))
+    return pixels[top:bottom, left:right] if left < right and top < bottom else None
 
 
 def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any], names: Sequence[str]) -> bytes:

@@ -31,6 +31,8 @@ kind = "lamp"
 name = "pump_lamp"
 position_m = [0.0, 0.0]
 radius_m = 0.01
+normal = ["on"]
+what_to_do = "start the pump"
 """
 MOUNT = """
 schema = 1

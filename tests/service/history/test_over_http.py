@@ -152,10 +152,8 @@ def test_the_service_comes_up_with_a_damaged_history_and_names_it(write_cell: Wr
     cell = load_cell(write_cell(robot=True))
     options = Options(port=0, runs_dir=tmp_path / "runs", inline=True)
     panelwright = Panelwright(cell, options, operations=OPERATIONS)
-    try:
-        (aside,) = panelwright.service.history.set_aside
-        panelwright.service.history.add([replace(reading(0), object="pump_lamp")])
-        records = panelwright.service.journal.records(kinds=("history-set-aside",))
-        assert [record.data["file"] for record in records] == [str(aside)]
-    finally:
-        panelwright.service.close()
+    (aside,) = panelwright.service.history.set_aside
+    panelwright.service.history.add([replace(reading(0), object="pump_lamp")])
+    panelwright.service.close()  # which waits for the journal
+    records = panelwright.service.journal.records(kinds=("history-set-aside",))
+    assert [record.data["file"] for record in records] == [str(aside)]

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +19,8 @@ from hal.errors import CellError, DeviceFault, InvalidRequest, NotFound
 from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
 from service.evaluate import evaluate
+from service.history.observer import Observations
+from service.history.store import History
 from service.operations.acquisition import look, settle
 from service.operations.find_panel import locate
 from service.operations.inspect import look_close
@@ -53,6 +56,9 @@ def mission_context(folder: Path, seed: int, *, misplaced_m: float = 0.0) -> Ite
             task=TaskContext(Task(id="test", verb="missions", request={}, moves=True), folder / "artefacts"),
             runs_dir=folder / "runs",
             world=WorldModel(),
+            observer=Observations(history=History(folder / "history", cell="bench", panel="bench")).of_task(
+                task="test", verb="missions", asked_by="alice", cell_now_s=runtime.clock.now_s
+            ),
         )
     finally:
         runtime.close()
@@ -127,6 +133,22 @@ def test_a_planted_wrong_truth_changes_nothing_but_the_judgement(tmp_path: Path)
     assert depths["bypass"]["views"] >= 3 and depths["bypass"]["sigma_m"] < 0.0015
     pictures = [path.name for path in (tmp_path / "honest/runs").glob("*/*.png")]
     assert {"lights.png", "range.png", "surfaces.png", "pose.png", "wrench.png", "joints.png"} <= set(pictures)
+
+    assert_everything_was_stored(tmp_path / "honest", honest)
+
+
+def assert_everything_was_stored(folder: Path, report: dict[str, Any]) -> None:
+    """Check that the history has every reading of the report, with its picture, and what the control was told to be."""
+    history = History(folder / "history", cell="bench", panel="bench")
+    stored = [row.reading for row in history.reader().all(history.ask())]
+    read = [(one["name"], one["value"], one["state"], one["text"]) for one in report["readings"] if not one["reason"]]
+    assert set(read) <= {(one.object, one.value, one.state, one.text) for one in stored if one.is_valid}
+    assert {one.object for one in stored} == {one["name"] for one in report["readings"]}
+    assert {one.mission for one in stored} == {report["mission"]}
+    assert (stored[-1].object, stored[-1].told, stored[-1].phase) == ("setpoint", "65", "after setpoint")
+    assert all(0.0 < one.cell_s < 1000.0 and one.asked_by == "alice" for one in stored)
+    sizes = [cv2.imread(str(history.crops.path(str(one.crop)))).shape[:2] for one in stored]
+    assert len(sizes) == len(stored) and all(16 < side < 480 for size in sizes for side in size)
 
 
 def test_a_control_that_cannot_be_operated_keeps_the_mission_from_no_other(

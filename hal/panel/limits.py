@@ -1,0 +1,61 @@
+"""Limits and normal states of an object, beyond which an alarm is raised; words as in ISA-18.2 and IEC 62682."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from hal.panel.parts import NotNegative, Positive
+from hal.panel.turn import meant_otherwise
+from hal.strict import Strict
+
+if TYPE_CHECKING:
+    from hal.panel.base import PanelObject
+
+Priority = Literal["low", "medium", "high", "urgent"]
+ORDER = ("low_low", "low", "high", "high_high")
+
+
+class Limits(Strict):
+    """Limits of a value, in the unit of the object's scale (radians for an angle)."""
+
+    low_low: float | None = None
+    low: float | None = None
+    high: float | None = None
+    high_high: float | None = None
+    deadband: Annotated[
+        NotNegative, Field(description="an alarm ends when the value is inside of its limit by this much")
+    ] = 0.0
+    delay_s: Annotated[NotNegative, Field(description="how long a value must be beyond a limit before an alarm")] = 0.0
+    rate_per_s: Annotated[Positive | None, Field(description="greatest change per second between two readings")] = None
+
+    @model_validator(mode="after")
+    def _are_in_order(self) -> Limits:
+        given = self.given
+        if not given and self.rate_per_s is None:
+            raise meant_otherwise("no limit is given", "give low_low, low, high, high_high or rate_per_s")
+        for (name, value), (next_name, next_value) in pairwise(given.items()):
+            if value >= next_value:
+                what = f"{name} = {value:g} is not below {next_name} = {next_value:g}"
+                raise meant_otherwise(what, "the order is low_low < low < high < high_high")
+        above = [value for name, value in given.items() if name.startswith("high")]
+        below = [value for name, value in given.items() if name.startswith("low")]
+        if above and below and self.deadband >= min(above) - max(below):
+            what = f"deadband = {self.deadband:g} is not smaller than the room between the limits"
+            raise meant_otherwise(what, "an alarm could never end: give a smaller deadband")
+        return self
+
+    @property
+    def given(self) -> dict[str, float]:
+        """The limits that are set, by name, from the lowest to the highest."""
+        return {name: value for name in ORDER if (value := getattr(self, name)) is not None}
+
+
+def unit_of(panel_object: PanelObject) -> str:
+    """Return the unit of an object's values; empty if it has none."""
+    if panel_object.value_is_angle:
+        return "rad"
+    scale = getattr(panel_object, "scale", None)
+    return str(getattr(panel_object if scale is None else scale, "unit", ""))

@@ -14,6 +14,7 @@ from hal.config import load_cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceUnavailable, InvalidRequest, MotionRefused, Unsupported
 from service.processes.cell import CellRuntime, gathered
+from service.processes.latch import Latch
 from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
 from tests.service.conftest import WriteCell
@@ -189,6 +190,15 @@ def test_close_leaves_no_process_and_no_file(write_cell: WriteCell, tmp_path: Pa
     supervisor.close()
     assert not [pid for pid in pids if psutil.pid_exists(pid) and _runs(psutil.Process(pid))]
     assert not folder.exists()
+
+
+def test_close_latches_the_stop_before_anything_ends(write_cell: WriteCell) -> None:
+    supervisor = Supervisor(load_cell(write_cell()), inline=True)
+    supervisor.start()
+    with Latch(supervisor.folder / "latch") as latch:  # stays readable when its file is gone
+        assert not latch.is_set()
+        supervisor.close()
+        assert latch.is_set()
 
 
 def test_a_reset_that_has_not_seen_the_newest_stop_is_refused(write_cell: WriteCell) -> None:

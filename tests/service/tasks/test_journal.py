@@ -8,13 +8,14 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from service.errors import JournalError
-from service.tasks.journal import Journal
-from service.tasks.journal_reader import FIRST_HASH
+from service.tasks.journal import Journal, _opened
+from service.tasks.journal_reader import FIRST_HASH, seal
 
 
 def test_what_was_appended_is_read_back_in_order(tmp_path: Path) -> None:
@@ -100,6 +101,18 @@ def test_only_its_user_may_read_the_key_of_a_journal_and_an_older_journal_gets_o
     journal.append("tick", {})
     assert journal.verify() == 1
     journal.close()
+
+
+def test_a_seal_is_worth_nothing_without_the_key_of_its_journal() -> None:
+    assert seal(b"a" * 32, 7, "x") != seal(b"b" * 32, 7, "x")
+    assert len({seal(b"a" * 32, 7, "x"), seal(b"a" * 32, 8, "x"), seal(b"a" * 32, 7, "y")}) == 3
+
+
+def test_every_commit_is_flushed_because_a_power_cut_is_harder_than_a_kill(tmp_path: Path) -> None:
+    """No test can cut the power, so this one asks SQLite (https://sqlite.org/pragma.html#pragma_synchronous)."""
+    with closing(_opened(tmp_path / "j.sqlite", b"key")) as db:
+        assert db.execute("PRAGMA synchronous").fetchone() == (2,), "FULL"
+        assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
 SMALL = 60_000  # some hundred rows of `filled`

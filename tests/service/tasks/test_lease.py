@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -64,6 +65,23 @@ def test_heartbeats_keep_it_and_silence_ends_it() -> None:
     clock.sleep(TTL_S)
     lease.expire()
     assert losses == ["the lease of alice lapsed: no heartbeat for 2 s"]
+    with pytest.raises(StaleEpoch):
+        lease.heartbeat(grant.token)
+
+
+@pytest.mark.parametrize("jump_s", [3600.0, -3600.0])
+def test_a_wall_clock_that_is_set_by_an_hour_ends_no_lease_and_prolongs_none(
+    monkeypatch: pytest.MonkeyPatch, jump_s: float
+) -> None:
+    clocks = {"time": 1.8e9, "monotonic": 5000.0}
+    monkeypatch.setattr(time, "time", lambda: clocks["time"])
+    monkeypatch.setattr(time, "monotonic", lambda: clocks["monotonic"])
+    lease = LeaseDesk(ttl_s=TTL_S)  # on the clock of the machine
+    grant = lease.acquire("alice")
+    clocks["time"] += jump_s
+    clocks["monotonic"] += 0.9 * TTL_S
+    assert lease.heartbeat(grant.token).remaining_s == pytest.approx(TTL_S)
+    clocks["monotonic"] += TTL_S
     with pytest.raises(StaleEpoch):
         lease.heartbeat(grant.token)
 

@@ -1,0 +1,57 @@
+"""A reset clears only a stop that somebody has seen, and only while the stop port answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hal.errors import MotionRefused
+from service.processes.latch import Latch, LatchState
+from service.processes.stop_desk import Records, StopDesk
+
+
+class Host:
+    """Writes the latch at once; `alive` says whether its port answers."""
+
+    pid = None
+
+    def __init__(self, latch: Latch) -> None:
+        self.latch = latch
+        self.alive = True
+
+    def stop(self, source: str) -> LatchState:
+        return self.latch.set(source)
+
+    def reset(self, source: str, *, seen_count: int) -> bool:
+        return self.latch.reset(source, seen_count=seen_count)
+
+    def is_alive(self) -> bool:
+        return self.alive
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def latch(tmp_path: Path) -> Iterator[Latch]:
+    with Latch.create(tmp_path / "latch") as latch:
+        yield latch
+
+
+def test_a_reset_without_a_count_clears_no_stop_of_this_moment(latch: Latch) -> None:
+    desk = StopDesk(latch, Host(latch), Records())
+    desk.stop("a person")
+    with pytest.raises(MotionRefused, match="ago, so it stays latched"):
+        desk.reset("test", seen_count=None)
+    assert latch.is_set()
+    assert not desk.reset("test", seen_count=latch.state().count).is_latched
+
+
+def test_no_reset_without_a_stop_port(latch: Latch) -> None:
+    host = Host(latch)
+    desk = StopDesk(latch, host, Records())
+    host.alive = False
+    with pytest.raises(MotionRefused, match="stop process is down"):
+        desk.reset("test", seen_count=desk.stop("a person").count)
+    assert latch.is_set()

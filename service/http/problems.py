@@ -13,6 +13,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
 from hal.errors import CellError, Retry
@@ -127,6 +128,13 @@ def install(app: FastAPI, *, paths: Sequence[str]) -> None:
     async def _too_large(_request: Request, _error: BodyTooLarge) -> Response:
         return problem_response(
             413, "body-too-large", "the body is too large", hint="send less than 1 MB, an image less than 32 MB"
+        )
+
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(_request: Request, _error: ClientDisconnect) -> Response:
+        # Nobody reads this answer; without a handler the log would report a defect.
+        return problem_response(
+            400, "body-cut-off", "the client left before its body was complete", hint="send it again"
         )
 
     @app.exception_handler(RequestValidationError)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import socket
 from collections.abc import Iterator
+from typing import Any
 
 import httpx2
 import pytest
@@ -14,6 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from schemathesis.specs.openapi.checks import response_schema_conformance, status_code_conformance
 
+from service.http.app import create_app
+from service.http.guard import Allowed
 from service.serve import Panelwright
 
 JSON = {"Content-Type": "application/json"}
@@ -144,6 +148,26 @@ def test_a_body_that_hides_its_length_is_cut_off(client: httpx2.Client) -> None:
             yield b" " * 50_000
 
     _assert_problem(client.post("/v1/hold", content=pieces(), headers=JSON), 413)
+
+
+@pytest.mark.parametrize(("path", "media"), [("/v1/lease", b"application/json"), ("/v1/images", b"image/png")])
+def test_a_client_that_leaves_in_the_middle_of_its_body_is_no_defect(
+    served: Panelwright, path: str, media: bytes
+) -> None:
+    guard = create_app(served.service, allowed=Allowed(hosts=frozenset({"h"}), origins=frozenset()), stop_url="")
+    headers = [(b"host", b"h"), (b"content-type", media), (b"content-length", b"9")]
+    scope = {"type": "http", "method": "POST", "path": path, "headers": headers, "query_string": b"", "root_path": ""}
+    parts: list[Any] = [{"type": "http.request", "body": b'{"', "more_body": True}, {"type": "http.disconnect"}]
+    sent: list[Any] = []
+
+    async def receive() -> Any:
+        return parts.pop(0)
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    asyncio.run(guard({**scope, "http_version": "1.1", "scheme": "http"}, receive, send))
+    assert sent[0]["status"] == 400
 
 
 def _raw(served: Panelwright, request: bytes) -> bytes:

@@ -1,26 +1,27 @@
 # Everything runs from here. Each target does its own set-up: Python 3.11 is all that a machine needs.
 PYTHON ?= python3.11
 BIN := .venv/bin
-PACKAGES := hal drivers simbackend perception fusion manipulation service benchmarks examples
+PRODUCT := hal drivers simbackend perception fusion manipulation service
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-# uv fetches packages side by side. It does not read pip's configuration: where it finds nothing, pip does the same.
-# Both say nothing while they fetch, so a line every five seconds does.
+# uv fetches packages side by side and refuses files whose hash is not in hashes.txt. It does not read pip's configuration: where
+# it finds nothing, pip does the same without hashes. Both say nothing while they fetch, so a line every five seconds does.
 define install
 ( while sleep 5; do echo "setup: fetching packages"; done ) & ticker=$$!; trap 'kill $$ticker' EXIT; \
-$(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt $(1) || { echo "setup: pip takes over from uv"; \
-    $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt $(1); }
+$(BIN)/uv pip install --quiet --python $(BIN)/python -c hashes.txt $(1) 2>.venv/uv.log || { \
+    if grep -qi 'hash mismatch' .venv/uv.log; then cat .venv/uv.log; echo "error: a package is not the one that hashes.txt names"; exit 2; fi; \
+    echo "setup: pip takes over from uv"; $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt $(1); }
 endef
 
-.PHONY: docs help setup warm test-packages demo serve test test-wire test-fast lint lint-style lint-types lint-layers format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
+.PHONY: docs help setup warm test-packages demo serve test test-wire test-fast test-planted lint lint-style lint-types lint-layers lint-security hashes sbom format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
 
 setup: .venv/ready  ## Make .venv with everything in it
 
-.venv/ready: pyproject.toml constraints.txt
+.venv/ready: pyproject.toml constraints.txt hashes.txt
 	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) not found. panelwright needs Python 3.11 (PyBullet has no newer wheels)."; \
 	    echo "  try    install python3.11 and python3.11-venv, or give its path: make PYTHON=/path/to/python3.11"; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "error: $(PYTHON) is $$($(PYTHON) --version 2>&1), not 3.11."; \
@@ -57,8 +58,11 @@ test-wire: setup  ## Run only the missions over emulated wires
 test-fast: setup  ## Run the tests without missions, browsers and scaffolds
 	@$(BIN)/python -m pytest --numprocesses 4 --dist loadscope --no-loadscope-reorder -m 'not slow and not wire'
 
-lint: setup  ## Style, types and layering, side by side
-	@$(MAKE) --no-print-directory -j 3 --output-sync=target lint-style lint-types lint-layers
+test-planted: setup  ## Plant each defect of tests/planted and show that a test fails (nightly: ten minutes)
+	@$(BIN)/python -m tests.planted $(PLANTED)
+
+lint: setup  ## Style, types, layering and security, side by side
+	@$(MAKE) --no-print-directory -j 3 --output-sync=target lint-style lint-types lint-layers lint-security
 
 lint-style:
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
@@ -68,6 +72,17 @@ lint-types:
 
 lint-layers:
 	@$(BIN)/lint-imports
+
+lint-security:
+	@$(BIN)/bandit --quiet --recursive --configfile pyproject.toml $(PRODUCT) && echo "bandit: nothing found"
+
+hashes:  # writes hashes.txt anew, after a change of constraints.txt
+	@{ sed -n 1p hashes.txt; $(BIN)/uv pip compile --quiet --no-deps --generate-hashes --no-header --no-annotate --python-version 3.11 constraints.txt; } \
+	    > .venv/hashes.txt && mv .venv/hashes.txt hashes.txt
+
+sbom: setup  ## Write build/sbom.json, the parts of this installation (CycloneDX)
+	@mkdir -p build && $(BIN)/uv tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py environment --pyproject pyproject.toml \
+	    --output-reproducible --output-file build/sbom.json $(BIN)/python && echo "sbom: build/sbom.json"
 
 docs: setup  ## Build the pages into site/, with search
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet && echo "docs: open site/index.html"

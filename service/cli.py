@@ -44,6 +44,7 @@ def _app() -> Callable[[], None]:
     import typer
 
     from service.commands import alarms, calibrate, devices, init, tasks
+    from service.commands.chaos import chaos
     from service.commands.check import check
     from service.commands.demo import demo
     from service.commands.develop import conform, emulate, new_driver
@@ -75,6 +76,7 @@ def _app() -> Callable[[], None]:
     app.command()(record)
     app.command()(replay)
     app.command()(sweep)
+    app.command()(chaos)
     app.command()(foxglove)
     app.command()(doctor)
     app.command()(check)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterable
 from importlib.metadata import requires, version
@@ -51,3 +52,14 @@ def test_every_pin_is_installed_and_every_installed_package_is_pinned() -> None:
 def test_the_installed_versions_are_the_pinned_ones() -> None:
     pinned = _pinned()
     assert {name: version(name) for name in pinned} == pinned
+
+
+def test_every_pin_has_hashes_and_no_address_of_a_registry() -> None:
+    text = (ROOT / "hashes.txt").read_text(encoding="utf-8")
+    assert "//" not in text, "a registry's address belongs into the configuration of a machine"
+    blocks = [block.split() for block in re.split(r"\n(?=\w)", text.split("\n", 1)[1].strip().replace("\\\n", ""))]
+    hashed = {canonicalize_name(name): pin for name, _, pin in (words[0].partition("==") for words in blocks)}
+    assert hashed == _pinned(), "`make hashes` writes hashes.txt anew"
+    marks = [mark for _, *marks in blocks for mark in marks]
+    assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", mark) for mark in marks)
+    assert all(len(words) > 1 for words in blocks)

@@ -24,7 +24,7 @@ def find_adapters(*, within_s: float = SEARCH_S) -> list[dict[str, Any]]:
     """Return `interface`, `channel` and further options of the adapters found; after `within_s` the search is ended."""
     command = module_command("drivers.transport.can_adapters")
     try:
-        child = subprocess.run(  # noqa: S603
+        child = subprocess.run(  # noqa: S603 - our own interpreter and code
             command, check=False, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=within_s
         )
     except subprocess.TimeoutExpired as ended:

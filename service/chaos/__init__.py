@@ -1,0 +1,1 @@
+"""Breaks a running service on purpose, and judges by invariants what it does then."""

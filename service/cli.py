@@ -43,7 +43,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import alarms, calibrate, devices, init, tasks
+    from service.commands import alarms, calibrate, devices, init, keys, tasks
     from service.commands.chaos import chaos
     from service.commands.check import check
     from service.commands.demo import demo
@@ -87,6 +87,7 @@ def _app() -> Callable[[], None]:
     app.command()(journal)
     app.command()(history)
     app.add_typer(alarms.app, name="alarms")
+    app.add_typer(keys.app, name="keys")
     app.command()(conform)
     app.command()(warm)
     app.command()(teach)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import httpx2
@@ -64,11 +66,15 @@ class Client:
     Args:
         url: address of the service, e.g. `http://127.0.0.1:8460`.
         timeout_s: the longest wait for one answer.
+        key: the key to send, for a service that has keys.
+        ca: file with the certificate to trust, for an https address; by default those of the system.
         is_lasting: whether the service goes on after this client, so that hints may name its address.
     """
 
     url: str = DEFAULT_URL
     timeout_s: float = 40.0
+    key: str | None = field(default=None, repr=False)
+    ca: Path | None = None
     is_lasting: bool = True
 
     def addressed(self, hint: str) -> str:
@@ -101,9 +107,11 @@ class Client:
         """
         url = self._address()
         try:
-            return Client(url=self.url, timeout_s=STOP_WAIT_S).post("/v1/stop")
+            return replace(self, timeout_s=STOP_WAIT_S).post("/v1/stop")
         except DeviceUnavailable as error:
-            beside = url.copy_with(port=(url.port or 80) + 1)
+            beside = url.copy_with(
+                scheme="http", port=(url.port or 80) + 1
+            )  # the stop port has no TLS and needs no key
             try:
                 return Client(url=str(beside), timeout_s=STOP_WAIT_S).post("/v1/stop")
             except CellError:
@@ -144,9 +152,9 @@ class Client:
         """Open a successful answer for reading; a connection that breaks meanwhile raises `DeviceUnavailable`."""
         url = self._address().join(path)
         # Ignore proxies of the environment, because a cell is reached directly.
-        with httpx2.Client(timeout=self.timeout_s, trust_env=False) as connection:
+        with httpx2.Client(timeout=self.timeout_s, trust_env=False, verify=self._trusted(url)) as connection:
             try:
-                with connection.stream(method, url, json=body, headers=headers) as answer:
+                with connection.stream(method, url, json=body, headers={**self._own_headers(), **headers}) as answer:
                     if answer.status_code >= httpx2.codes.BAD_REQUEST:
                         problem = _problem(answer.read(), answer.status_code)
                         raise ApiError({**problem, "hint": self.addressed(str(problem.get("hint", SEE_LOG)))})
@@ -159,9 +167,25 @@ class Client:
             url = httpx2.URL(self.url if "//" in self.url else f"http://{self.url}")  # http is the default, as for curl
         except httpx2.InvalidURL:
             url = httpx2.URL("")
-        if not url.host or url.scheme != "http":
+        if not url.host or url.scheme not in ("http", "https"):
             raise ConfigError(f"{self.url!r} is not the address of a service", hint=f"for example {DEFAULT_URL}")
         return url
+
+    def _own_headers(self) -> dict[str, str]:
+        return {} if self.key is None else {"Authorization": f"Bearer {self.key}"}
+
+    def _trusted(self, url: httpx2.URL) -> ssl.SSLContext | bool:
+        """Return what httpx needs to check the service's certificate.
+
+        Raises:
+            ConfigError: the file of the trusted certificate cannot be used.
+        """
+        if url.scheme != "https" or self.ca is None:
+            return True
+        try:
+            return ssl.create_default_context(cafile=self.ca)
+        except OSError as error:  # also of a file without a certificate
+            raise ConfigError(f"{self.ca} is no certificate: {error}", hint="a file in PEM format") from error
 
     def _lost(self, error: Exception) -> DeviceUnavailable:
         why = str(error).partition("] ")[2] or str(error) or type(error).__name__  # without the error number

@@ -18,6 +18,8 @@ from hal.caller import calling_as
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
 from service.alarms.desk import AlarmDesk
+from service.access.keys import FILE as KEYS_FILE
+from service.access.keys import KeyBook
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.history.observer import Observations
@@ -29,7 +31,7 @@ from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
 from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
-from service.tasks.lease import LeaseDesk
+from service.tasks.lease import Command, LeaseDesk
 from service.tasks.model import Artefact, Task, TaskState
 from service.tasks.store import TaskContext, TaskStore
 from service.world_model import WorldModel
@@ -42,6 +44,7 @@ RESTORED_TASKS = 100
 LOOK_S = 0.05
 ALARMS_S = 1.0
 RESTORED_ALARMS = 1000
+NO_LEASE = Command()
 COMMIT_S = 2.0  # an answer waits no longer for a slow disk
 log = logging.getLogger(__name__)
 
@@ -82,6 +85,7 @@ class Service:
         self.history = self._open_history(state_dir / "history")
         self.alarms = self._open_alarms(state_dir / "alarms.json")
         self.observations = Observations(history=self.history, listeners=[self.alarms.take])
+        self.keys = book_of(runs_dir)
         self.supervisor = Supervisor(
             cell,
             stop_listener=stop_listener,
@@ -99,7 +103,6 @@ class Service:
             self.tasks.subscribe(self._recording.on_task)
         self.lease = LeaseDesk(
             ttl_s=cell.file.safety.lease_ttl_s,
-            on_loss=self.tasks.cancel_moving,
             others=self.tasks.moving_for_others,
             report=self.note,
             commit=self.commit,
@@ -118,16 +121,28 @@ class Service:
             CellError: the cell could not start.
         """
         self.note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
-        threading.Thread(target=self._watch, name="watch", daemon=True).start()
+        for watch in (self._watch_stop, self._watch_lease):
+            threading.Thread(target=watch, name=watch.__name__, daemon=True).start()
         threading.Thread(target=self._tend_alarms, name="alarms", daemon=True).start()
         self.supervisor.start()
 
-    def submit(self, verb: str, request: BaseModel, *, lease_token: str | None = None, key: str | None = None) -> Task:
+    def submit(
+        self,
+        verb: str,
+        request: BaseModel,
+        *,
+        command: Command = NO_LEASE,
+        key: str | None = None,
+        is_followed: bool = False,
+    ) -> Task:
         """Start the operation `verb` as a task.
+
+        Args:
+            is_followed: whether a client must follow a motion that it asks for without a lease; see `sub_leases`.
 
         Raises:
             InvalidRequest: there is no such verb, or the request is not valid for this cell.
-            LeaseError: another client holds the cell.
+            LeaseError: another client holds the cell, or the command is old or came too late or too early.
             Stopped: the operation moves the arm, and the stop is latched.
             DeviceUnavailable: the cell is not running.
             Busy, JournalError: the task could not be accepted.
@@ -136,18 +151,24 @@ class Service:
         if operation is None:
             raise InvalidRequest(f"there is no verb {verb!r}", hint=f"verbs: {', '.join(self.operations)}")
         operation.check(self.cell, request)
-        moves = operation.may_move(request)
-        holder = self.lease.check(lease_token) if moves else None
+        moves, holder = operation.may_move(request), None
+        if moves or operation.writes:
+            is_repeat = key is not None and self.tasks.has_key(key)
+            holder = self.lease.check(command.token) if is_repeat else self.lease.admit(command)
         self._check_cell()
         latch = self.supervisor.latch.state()
         if moves and latch.is_latched:
             raise stopped(latch.source)
+        sub = self.lease.lend(is_own=is_followed and holder is None) if moves else None
 
         def work(task: TaskContext) -> Any:
             def check_may_move() -> None:
                 task.check_cancelled()
                 self._check_not_stopped_since(latch.count)
+                if sub is not None:
+                    sub.check()
 
+            self.lease.check_in_time(command)  # again, because it may have waited in the queue
             connection = GatedConnection(
                 self.supervisor.connection,
                 check_may_move,
@@ -163,15 +184,20 @@ class Service:
                 return operation.run(context, request)
 
         plain = request.model_dump(mode="json")
-        task = self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key)
+        task = self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key, sub_lease=sub)
         if moves:
-            self._confirm(task, lease_token)
+            self._confirm(task, command.token)
         return task
 
     def _confirm(self, task: Task, lease_token: str | None) -> None:
         """Check the lease again, because a client that took it over before the task was listed could not cancel the task."""
+        sub = task.sub_lease
         try:
             self.lease.check(lease_token)
+            if sub is not None:
+                sub.on_loss = lambda reason: self.tasks.cancel(task.id, reason=reason)
+                sub.is_over = lambda: task.state.is_final
+                sub.check()
         except LeaseError as error:
             with suppress(NotPossibleNow):
                 self.tasks.cancel(task.id, reason=error.what)
@@ -250,15 +276,18 @@ class Service:
         if self.supervisor.is_ready:
             self.supervisor.connection.mover.cancel()
 
-    def _watch(self) -> None:
+    def _watch_stop(self) -> None:
         while not self._is_closing.wait(LOOK_S):
-            self.lease.expire()
             self.supervisor.note_stop()
 
     def _tend_alarms(self) -> None:
         """Let the alarms' time pass, in a thread of its own because each change waits for the disk."""
         while not self._is_closing.wait(ALARMS_S):
             self.alarms.tick()
+    def _watch_lease(self) -> None:
+        """End the lease at the moment at which its heartbeat is overdue; a thread of its own, so that no record delays it."""
+        while not self._is_closing.wait(min(LOOK_S, self.lease.soonest_s())):
+            self.lease.expire()
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
         """Write an entry to the journal without waiting for the disk."""
@@ -328,6 +357,11 @@ class Service:
         for task in tasks.values():
             self.tasks.restore(task)
         self.tasks.sweep()
+
+
+def book_of(runs_dir: Path) -> KeyBook:
+    """Return the keys of the service with this folder."""
+    return KeyBook(runs_dir / ".service" / KEYS_FILE)
 
 
 def _is_alone(lock: IO[str]) -> bool:

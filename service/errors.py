@@ -49,6 +49,18 @@ class StaleEpoch(LeaseError):
     """The lease that came with the command is not valid any more."""
 
 
+class StaleSequence(LeaseError):
+    """A command has a number that is not greater than that of an earlier one, or none although the others have."""
+
+
+class Expired(LeaseError):
+    """The time until which a command could begin has passed; nothing moved."""
+
+
+class TooDistant(LeaseError):
+    """The time until which a command may begin is too far away; nothing moved."""
+
+
 class Aborted(CellError):
     """The service ended while the task ran; the arm was stopped. The task was not taken up again."""
 
@@ -63,6 +75,20 @@ class JournalError(CellError):
 
 class HistoryError(CellError):
     """The history of readings cannot be written, so no reading may be reported; or it cannot be read."""
+class Unauthenticated(CellError):
+    """The service has keys, and the request came without a valid one."""
+
+    retry = Retry.AFTER_FIX
+
+
+class Forbidden(CellError):
+    """The role of the key does not permit the request."""
+
+    retry = Retry.AFTER_FIX
+
+
+class KeysUnusable(CellError):
+    """The file of keys cannot be used, so no key is accepted."""
 
     retry = Retry.AFTER_FIX
 

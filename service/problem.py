@@ -28,6 +28,9 @@ STATUS: dict[type[CellError], HTTPStatus] = {
     errors.Busy: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.JournalError: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.HistoryError: HTTPStatus.SERVICE_UNAVAILABLE,
+    errors.Unauthenticated: HTTPStatus.UNAUTHORIZED,
+    errors.Forbidden: HTTPStatus.FORBIDDEN,
+    errors.KeysUnusable: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.FileFault: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.Aborted: HTTPStatus.CONFLICT,
 }

@@ -8,7 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -18,7 +18,9 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.gc_freeze import freeze_loaded
-from service.core import Service
+from service.client import Client
+from service.core import Service, book_of
+from service.exposure import Exposure, unix_socket
 from service.operations import Operation
 from service.processes.stop_host import bound_socket
 
@@ -40,9 +42,10 @@ class Options:
         warm: whether to load the compiled kernels at the start.
         record: file to record everything in.
         replay: starts a recorded cell in place of the devices; needs `inline`.
+        exposure: where it listens, and how strangers are kept out.
     """
 
-    host: str = "127.0.0.1"
+    exposure: Exposure = field(default_factory=Exposure)
     port: int = 8460
     stop_port: int | None = None
     runs_dir: Path = Path("runs")
@@ -57,7 +60,8 @@ class Panelwright:
     """Starts and closes everything that `serve` runs.
 
     Raises:
-        ConfigError: a port is in use, or given twice.
+        ConfigError: a port is in use, or given twice, or strangers could use the service.
+        KeysUnusable: the file of keys cannot be used.
     """
 
     def __init__(self, cell: Cell, options: Options, *, operations: Mapping[str, Operation] | None = None) -> None:
@@ -66,32 +70,31 @@ class Panelwright:
                 f"port {options.port} cannot serve the API and the stop process",
                 hint="leave --stop-port out, or give it another number",
             )
-        listener = bound_socket(options.host, options.port)
+        exposure = self._exposure = options.exposure
+        exposure.check(book_of(options.runs_dir))
+        listener = bound_socket(exposure.host, options.port)
         self.port: int = listener.getsockname()[1]
         stop_port = options.stop_port if options.stop_port is not None else (options.port and self.port + 1)
         try:
-            stop_listener = bound_socket(options.host, stop_port, option="--stop-port")
+            stop_listener = bound_socket(exposure.stop_host, stop_port, option="--stop-port")
+            for_proxy = [] if exposure.unix_socket is None else [unix_socket(exposure.unix_socket)]
         except CellError:
             listener.close()
             raise
-        self.host = options.host
         self.stop_port: int = stop_listener.getsockname()[1]
         self._error: CellError | None = None
         self._is_settled = threading.Event()
         self._is_ending = threading.Event()
         self._wants_warmth = options.warm and not options.inline
         self._server: HttpServer | None = None
-        self._listener = listener
-        from service.http.server import names_of
-
-        hosts, origins = names_of(options.host, self.port)
-        self._hosts, self._origins = hosts, origins
+        self._listeners = [listener, *for_proxy]
+        self._hosts, self._origins = exposure.names_at(self.port)
         self.service = Service(
             cell,
             _shipped() if operations is None else operations,
             runs_dir=options.runs_dir,
             stop_listener=stop_listener,
-            origins=tuple(sorted(origins)),
+            origins=tuple(sorted(self._origins)),
             inline=options.inline,
             partial=options.partial,
             record=options.record,
@@ -101,12 +104,16 @@ class Panelwright:
     @property
     def url(self) -> str:
         """Address of the HTTP server."""
-        return f"http://{self.host}:{self.port}"
+        return self._exposure.url(self.port)
 
     @property
     def stop_url(self) -> str:
         """Address of the stop process."""
-        return f"http://{self.host}:{self.stop_port}/v1/stop"
+        return f"http://{self._exposure.stop_host}:{self.stop_port}/v1/stop"
+
+    def client(self, *, timeout_s: float = 40.0) -> Client:
+        """Return a client of this service in this process, with a key of its own where keys are needed."""
+        return Client(url=self.url, timeout_s=timeout_s, key=self.service.keys.own(), is_lasting=False)
 
     @property
     def error(self) -> CellError | None:
@@ -157,7 +164,10 @@ class Panelwright:
         if self._server is not None:
             self._server.stop()
         self.service.close()
-        self._listener.close()
+        for listener in self._listeners:
+            listener.close()
+        if self._exposure.unix_socket is not None:
+            self._exposure.unix_socket.unlink(missing_ok=True)
 
     def wait_until_settled(self, timeout_s: float) -> bool:
         """Wait until the cell is ready or has failed; returns whether that happened in time."""
@@ -173,9 +183,11 @@ class Panelwright:
         from service.http.guard import Allowed
         from service.http.server import HttpServer
 
-        app = create_app(
-            self.service, allowed=Allowed(hosts=self._hosts, origins=self._origins), stop_url=self.stop_url
-        )
+        exposure = self._exposure
+        allowed = Allowed(hosts=self._hosts, origins=self._origins, proxies=exposure.proxied_from())
+        # The stop port is on this machine only, so that other machines are told the address of the API, with a path.
+        stop_url = self.stop_url if exposure.is_local else "/v1/stop"
+        app = create_app(self.service, allowed=allowed, stop_url=stop_url, cookie=f"panelwright_{self.port}")
 
         def on_exit(why: str) -> None:
             # Latch the stop first, through the stop process; then tell every stream to end.
@@ -183,7 +195,8 @@ class Panelwright:
             self.service.stop_quietly(why)
             state_of_app(app).hub.close()
 
-        self._server = HttpServer(app, self._listener, on_exit=on_exit)
+        tls = (exposure.tls_cert, exposure.tls_key) if exposure.tls_cert and exposure.tls_key else None
+        self._server = HttpServer(app, self._listeners, on_exit=on_exit, tls=tls)
         if self._wants_warmth:  # at the same time as the cell's start, which waits for another process
             from service.warm import load_modules
 

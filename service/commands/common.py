@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,7 @@ __all__ = [
     "find_cell",
     "read_cell",
     "state_style",
+    "use_key_file",
 ]
 
 Url = Annotated[str, typer.Option("--url", help="Address of a running service.", show_default=True)]
@@ -35,9 +37,26 @@ DEFAULT_CELL = Path("cells/bench.toml")
 UrlDefault = DEFAULT_URL
 
 
+def use_key_file(path: Path | None) -> None:
+    """Send the key in this file with all requests of this program; None for the key of the environment, if any."""
+    global _key_file  # noqa: PLW0603 - one option of the whole program
+    _key_file = path
+
+
+_key_file: Path | None = None
+
+
 def client_of(url: str) -> Client:
-    """Return a client of the service at `url`."""
-    return Client(url=url.rstrip("/"))
+    """Return a client of the service at `url`, with the key of `--key-file` or of the environment.
+
+    Raises:
+        ConfigError: the key file cannot be used.
+    """
+    from service.access.keys import key_from_file
+
+    key = os.environ.get("PANELWRIGHT_KEY") if _key_file is None else key_from_file(_key_file)
+    ca = os.environ.get("PANELWRIGHT_CA")
+    return Client(url=url.rstrip("/"), key=key or None, ca=Path(ca) if ca else None)
 
 
 def read_cell(path: Path, seed: int | None) -> Cell:

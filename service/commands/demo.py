@@ -45,7 +45,7 @@ def demo(
         try:
             panelwright.start()
             console.print(f"ready after {time.monotonic() - started_s:.1f} s at {panelwright.url}")
-            code = 0 if _mission(Client(url=panelwright.url, is_lasting=False), runs, judge=judge) else 1
+            code = 0 if _mission(panelwright.client(), runs, judge=judge) else 1
         except KeyboardInterrupt:
             console.print("Ctrl-C: stopping the arm and ending all processes")
             code = INTERRUPTED

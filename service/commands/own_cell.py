@@ -60,7 +60,7 @@ def run_on_cell(
     with one_interrupt():
         try:
             panelwright.start()
-            client = Client(url=panelwright.url, is_lasting=False)
+            client = panelwright.client()
             stop = client.get("/v1/stop")
             if stop["is_latched"] and moves:  # as in `demo`, whoever runs it states that the cell is clear
                 client.post("/v1/stop/reset", {"seen_count": stop["count"]})

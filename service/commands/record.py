@@ -51,7 +51,7 @@ def record(
     with one_interrupt():
         try:
             panelwright.start()
-            code = 0 if _recorded_task(Client(url=panelwright.url), task) else 1
+            code = 0 if _recorded_task(panelwright.client(), task) else 1
         except KeyboardInterrupt:
             console.print("Ctrl-C: stopping the arm and ending the recording")
             code = INTERRUPTED

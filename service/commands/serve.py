@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from service.serve import Panelwright
 
 START_PATIENCE_S = 120.0
-LOOPBACK = ("127.0.0.1", "localhost")
 
 
 def serve(
@@ -31,8 +30,20 @@ def serve(
         int | None, typer.Option(min=0, max=65535, help="Port of the stop process; the port after --port if not given.")
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; only loopback is allowed, because there are no keys.")
+        str, typer.Option(help="Address to listen on; any other than loopback needs keys, and TLS or a proxy.")
     ] = "127.0.0.1",
+    name: Annotated[
+        list[str] | None, typer.Option(help="A further name under which clients reach it; may be given several times.")
+    ] = None,
+    tls_cert: Annotated[Path | None, typer.Option(help="Certificate (PEM), with the chain.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Private key of the certificate (PEM).")] = None,
+    behind_proxy: Annotated[
+        bool, typer.Option("--behind-proxy", help="A proxy with TLS stands before it; needs --name and --proxy.")
+    ] = False,
+    proxy: Annotated[
+        list[str] | None, typer.Option(help="IP address of that proxy; may be given several times.")
+    ] = None,
+    unix_socket: Annotated[Path | None, typer.Option(help="A socket for that proxy, beside the port.")] = None,
     runs: Annotated[Path, typer.Option(help="Folder for reports, journal and artefacts.")] = Path("runs"),
     seed: SeedOption = None,
     warm: Annotated[bool, typer.Option(help="Load the compiled kernels right after the start.")] = True,
@@ -42,13 +53,24 @@ def serve(
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Start the cell and serve it until Ctrl-C, even if some devices are missing."""
+    from service.core import book_of
+    from service.exposure import Exposure
     from service.serve import Options, Panelwright
 
-    check_host(host)
+    exposure = Exposure(
+        host=host,
+        names=tuple(name or ()),
+        tls_cert=tls_cert,
+        tls_key=tls_key,
+        behind_proxy=behind_proxy,
+        proxies=tuple(proxy or ()),
+        unix_socket=unix_socket,
+    )
+    exposure.check(book_of(runs))  # before the cell file is read and kernels are compiled
     loaded = read_cell(cell, seed)
     compile_first()
     options = Options(
-        host=host,
+        exposure=exposure,
         port=port,
         stop_port=stop_port,
         runs_dir=runs,
@@ -80,17 +102,6 @@ def run_to_end(panelwright: Panelwright) -> NoReturn:
     leave(code)
 
 
-def check_host(host: str) -> None:
-    """Raise `ConfigError` for an address that other machines can reach, because there are no keys yet."""
-    from hal.errors import ConfigError
-
-    if host not in LOOPBACK:
-        raise ConfigError(
-            f"refusing to listen on {host}: anybody there could move the arm",
-            hint="listen on 127.0.0.1 and reach it through ssh -L or an authenticating proxy",
-        )
-
-
 def _announce(panelwright: Panelwright) -> None:
     panelwright.wait_until_settled(START_PATIENCE_S)
     if panelwright.error is None and not panelwright.is_ending:  # not after Ctrl-C during the start
@@ -103,6 +114,7 @@ def announcement(service: Service, url: str, stop_url: str) -> Iterator[str]:
     missing = service.supervisor.missing
     state = f"without {len(missing)} of {len(service.cell.file.devices)} devices" if missing else "ready"
     yield f"panelwright: {state} at [bold]{url}[/]   stop: POST {stop_url}"
+    yield from _access(service)
     for one in missing:
         connect = for_service(f"{one.hint}; then `panelwright devices connect {one.device}`", url)
         yield f"panelwright: without [bold]{one.device}[/]: {escape(one.why)}"
@@ -111,3 +123,14 @@ def announcement(service: Service, url: str, stop_url: str) -> Iterator[str]:
     if service.supervisor.latch.is_set():
         reset = for_service("`panelwright stop --reset`", url)
         yield f"panelwright: the stop is latched; {reset} when the cell is clear"
+
+
+def _access(service: Service) -> Iterator[str]:
+    """Yield who may use the service."""
+    book = service.keys
+    if book.is_open:
+        yield "panelwright: no keys: every program of this machine may move the arm (`panelwright keys add` changes this)"
+        return
+    active = book.active()
+    names = ", ".join(f"{escape(key.name)} ({key.role})" for key in active[:8]) + (", …" if len(active) > 8 else "")
+    yield f"panelwright: {len(active)} keys are valid: {names}" if active else "panelwright: no key is valid"

@@ -6,6 +6,7 @@ import platform
 import time
 from collections.abc import Callable
 from functools import partial
+from http import HTTPStatus
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,7 @@ from hal.clock import Deadline
 from hal.config import Cell, load_cell
 from hal.errors import REINSTALL, CellError, ConfigError, detail_lines
 from hal.registry import installed_drivers
-from service.client import Client
+from service.client import ApiError, Client
 from service.commissioning.cell_check import objects_in_reach
 from service.commissioning.preflight import check_machine, check_python, check_simulator
 from service.commissioning.to_measure import to_measure
@@ -122,6 +123,8 @@ def _served_cell(port: int) -> str | None:
     """Return the name of the cell that a service on this machine runs at `port`; None without one."""
     try:
         info = Client(url=f"http://127.0.0.1:{port}", timeout_s=ANSWER_S).get("/v1/info")
+    except ApiError as error:
+        return "of another user (it needs a key)" if error.problem.get("status") == HTTPStatus.UNAUTHORIZED else None
     except CellError:  # nothing answers, or another program does
         return None
     return str(info["cell"]) if isinstance(info, dict) and "cell" in info else None

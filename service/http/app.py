@@ -8,10 +8,11 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from fastapi import Depends, FastAPI
+from fastapi import Depends, FastAPI, Request
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
+from starlette.responses import JSONResponse
 from starlette.types import ASGIApp
 
 from service.core import Service
@@ -27,18 +28,21 @@ from service.http import (
     knowledge,
     missions,
     photographs,
+    session,
     stream,
     tasks,
     verbs,
 )
+from service.http.access import check_access
 from service.http.guard import Allowed, RequestGuard
 from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
 from service.http.metrics import Metrics
-from service.http.models import FaultRequest, LeaseRequest, ResetRequest, SwapRequest
+from service.http.models import FaultRequest, LeaseRequest, ResetRequest, SwapRequest, TakeOverRequest
 from service.http.page import Page
 from service.http.problems import Problem, install
 from service.http.query import check_query
+from service.http.session import LoginRequest
 from service.http.state import AppState
 from service.knowledge.teach import OutlineRequest, TeachRequest
 from service.readings import ReadingDesk
@@ -55,16 +59,19 @@ Poses are named `parent_from_child`; covariances are 6x6 over (dx, dy, dz, rx, r
 """
 
 
-def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
+def create_app(service: Service, *, allowed: Allowed, stop_url: str, cookie: str = "panelwright") -> ASGIApp:
     """Return the ASGI application of a service, which may still be starting.
 
     Args:
         allowed: hosts and origins that may use it.
         stop_url: address of the stop process, which is shown to clients.
+        cookie: name of the cookie of a browser's session.
     """
     state = AppState(
         service=service,
         stop_url=stop_url,
+        origins=allowed.origins,
+        cookie=cookie,
         hub=Hub(),
         metrics=Metrics(service),
         readings=ReadingDesk(lambda: service.supervisor.connection),
@@ -75,7 +82,8 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         description=DESCRIPTION,
         docs_url=None,  # FastAPI's pages load scripts from other hosts
         redoc_url=None,
-        dependencies=[Depends(check_query)],
+        openapi_url=None,  # a route of our own, so that it needs a key as every call does
+        dependencies=[Depends(check_access), Depends(check_query)],
         lifespan=_lifespan,
     )
     app.state.panelwright = state
@@ -93,11 +101,13 @@ def create_app(service: Service, *, allowed: Allowed, stop_url: str) -> ASGIApp:
         missions.router,
         history.router,
         alarms.router,
+        session.router,
         health.router,
         stream.router,
     )
     for router in routers:
         app.include_router(router)
+    app.add_api_route("/openapi.json", _api_document, include_in_schema=False)
     install(app, paths=[getattr(route, "path", "") for router in routers for route in router.routes])
     app.mount("/", Page(WEB, app.routes), name="page")
     bodies = [operation.request_model for operation in service.operations.values()]
@@ -124,6 +134,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
+async def _api_document(request: Request) -> JSONResponse:
+    return JSONResponse(request.app.openapi())
+
+
 def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
     """Return the API document, with the schemas of the bodies that strict readers parse."""
     if app.openapi_schema:
@@ -133,8 +147,10 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         *dict.fromkeys(bodies),
         FaultRequest,
         LeaseRequest,
+        LoginRequest,
         ResetRequest,
         SwapRequest,
+        TakeOverRequest,
         OutlineRequest,
         TeachRequest,
         *alarms.BODIES,

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, Field
 
 from service.http.problems import RESPONSES
-from service.http.state import AppState, State
+from service.http.state import Admitted, AppState, State
 from service.knowledge.calibrations import Calibrated
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"], responses=RESPONSES)
@@ -58,7 +58,7 @@ async def show_calibration(state: State, name: DeviceName) -> CalibrationView:
     summary="Use the cell file's own record again; the measured one is kept among the older ones",
     operation_id="forget_calibration",
 )
-async def forget_calibration(state: State, name: DeviceName) -> None:
+async def forget_calibration(state: State, _holder: Admitted, name: DeviceName) -> None:
     await state.in_thread(functools.partial(state.service.calibrations.forget, name))
     state.service.note("calibration-forgotten", {"device": name})
 

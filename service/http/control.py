@@ -10,15 +10,19 @@ from fastapi import APIRouter, Header, Request
 from fastapi import Depends as DependsOn
 
 from service.http.body import body_schema, strict_body
-from service.http.models import GrantView, LeaseRequest, LeaseView, ResetRequest, StopView
+from service.http.models import GrantView, LeaseRequest, LeaseView, ResetRequest, StopView, TakeOverRequest
 from service.http.problems import RESPONSES
-from service.http.state import AppState, LeaseToken, State
+from service.http.state import Admitted, AppState, State
 from service.processes.latch import LatchState
 from service.tasks.lease import Grant
 
 router = APIRouter(prefix="/v1", responses=RESPONSES)
 OwnToken = Annotated[str, Header(alias="Lease-Token", max_length=200, description="token from POST /v1/lease")]
+TakeOverBody = Annotated[TakeOverRequest, DependsOn(strict_body(TakeOverRequest))]
 HolderBody = Annotated[LeaseRequest, DependsOn(strict_body(LeaseRequest))]
+TAKE_OVER_SCHEMA = body_schema(
+    TakeOverRequest, {"holder": "alice@console-2", "reason": "bob has gone home"}, required=True
+)
 HOLDER_SCHEMA = body_schema(LeaseRequest, {"holder": "alice@console-2"}, required=True)
 
 
@@ -31,12 +35,12 @@ async def show_lease(state: State) -> LeaseView:
     "/lease", summary="Take the free lease", operation_id="acquire_lease", tags=["lease"], openapi_extra=HOLDER_SCHEMA
 )
 async def acquire_lease(state: State, request: HolderBody) -> GrantView:
-    return _grant(await state.act(functools.partial(state.service.lease.acquire, request.holder)))
+    return _grant(state, await state.act(functools.partial(state.service.lease.acquire, request.holder)))
 
 
 @router.post("/lease/heartbeat", summary="Renew the lease", operation_id="renew_lease", tags=["lease"])
 async def renew_lease(state: State, lease_token: OwnToken) -> GrantView:
-    return _grant(state.service.lease.heartbeat(lease_token))
+    return _grant(state, state.service.lease.heartbeat(lease_token))
 
 
 @router.post("/lease/release", summary="Give the lease back", operation_id="release_lease", tags=["lease"])
@@ -50,10 +54,11 @@ async def release_lease(state: State, lease_token: OwnToken) -> LeaseView:
     summary="Take the lease from its holder; the tasks of that holder are stopped",
     operation_id="take_over_lease",
     tags=["lease"],
-    openapi_extra=HOLDER_SCHEMA,
+    openapi_extra=TAKE_OVER_SCHEMA,
 )
-async def take_over_lease(state: State, request: HolderBody) -> GrantView:
-    return _grant(await state.act(functools.partial(state.service.lease.take_over, request.holder)))
+async def take_over_lease(state: State, request: TakeOverBody) -> GrantView:
+    take_over = functools.partial(state.service.lease.take_over, request.holder, reason=request.reason)
+    return _grant(state, await state.act(take_over))
 
 
 @router.get("/stop", summary="State of the software stop", operation_id="show_stop", tags=["stop"])
@@ -81,11 +86,8 @@ async def stop(state: State, request: Request) -> StopView:
     openapi_extra=body_schema(ResetRequest, {"seen_count": 3}),
 )
 async def reset_stop(
-    state: State,
-    request: Annotated[ResetRequest, DependsOn(strict_body(ResetRequest))],
-    lease_token: LeaseToken = None,
+    state: State, holder: Admitted, request: Annotated[ResetRequest, DependsOn(strict_body(ResetRequest))]
 ) -> StopView:
-    holder = state.service.lease.check(lease_token)
     source = f"POST /v1/stop/reset by {holder or 'a client without a lease'}"
     reset = functools.partial(state.service.supervisor.reset, source, seen_count=request.seen_count)
     return _stop(state, await state.act(reset))
@@ -94,12 +96,18 @@ async def reset_stop(
 def _lease(state: AppState) -> LeaseView:
     holder, epoch, left_s = state.service.lease.holder()
     return LeaseView(
-        is_held=holder is not None, holder=holder, epoch=epoch, ttl_s=state.service.lease.ttl_s, remaining_s=left_s
+        is_held=holder is not None,
+        holder=holder,
+        epoch=epoch,
+        ttl_s=state.service.lease.ttl_s,
+        remaining_s=left_s,
+        sequence=state.service.lease.newest_sequence(),
+        clock_s=state.service.lease.clock_s(),
     )
 
 
-def _grant(grant: Grant) -> GrantView:
-    return GrantView(is_held=True, **asdict(grant))
+def _grant(state: AppState, grant: Grant) -> GrantView:
+    return GrantView(**{**_lease(state).model_dump(), **asdict(grant), "is_held": True})
 
 
 def _stop(state: AppState, latch: LatchState) -> StopView:

@@ -16,7 +16,7 @@ from service.errors import NoSuchDevice
 from service.http.body import body_schema, strict_body
 from service.http.models import DeviceDetail, DeviceList, DeviceView, FaultRequest, HealthView, ReadingView, SwapRequest
 from service.http.problems import RESPONSES
-from service.http.state import AppState, LeaseToken, State
+from service.http.state import Admitted, AppState, State
 from service.http.swap_files import with_recordings
 from service.jsonable import jsonable
 from service.processes.connection import check_name
@@ -93,8 +93,8 @@ async def read_device(
 async def swap_device(
     state: State,
     name: Name,
+    _holder: Admitted,
     request: Annotated[SwapRequest, DependsOn(strict_body(SwapRequest))],
-    lease_token: LeaseToken = None,
 ) -> DeviceDetail:
     """Other devices are not affected. If the new driver does not connect, the old one is kept and the problem says so.
 
@@ -102,7 +102,6 @@ async def swap_device(
     are off until the next motion. The cell file is not changed and applies again after a restart of the service.
     """
     _check(state, name)
-    state.service.lease.check(lease_token)
     await state.in_thread(functools.partial(_swap, state, name, request))
     return await state.in_thread(functools.partial(_detail, state.service, name))
 
@@ -112,10 +111,9 @@ async def swap_device(
     summary="Connect a device again with its present driver and options",
     operation_id="connect_device",
 )
-async def connect_device(state: State, name: Name, lease_token: LeaseToken = None) -> DeviceDetail:
+async def connect_device(state: State, name: Name, _holder: Admitted) -> DeviceDetail:
     """For a device that did not connect at the cell's start, or whose driver has stopped. Refused as `PUT` is."""
     _check(state, name)
-    state.service.lease.check(lease_token)
     await state.in_thread(functools.partial(_connect, state, name))
     return await state.in_thread(functools.partial(_detail, state.service, name))
 
@@ -129,11 +127,10 @@ async def connect_device(state: State, name: Name, lease_token: LeaseToken = Non
 async def inject_fault(
     state: State,
     name: Name,
+    _holder: Admitted,
     request: Annotated[FaultRequest, DependsOn(strict_body(FaultRequest))],
-    lease_token: LeaseToken = None,
 ) -> DeviceView:
     _check(state, name)
-    state.service.lease.check(lease_token)
     return await state.act(functools.partial(_inject, state.service, name, request))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from service.knowledge.images import MAX_IMAGE_BYTES
 
 MAX_BODY_BYTES = 1_000_000
 LARGE_BODIES = {("POST", "/v1/images"): MAX_IMAGE_BYTES}
+PROXIED = "panelwright.is_proxied"  # whether the request came through the proxy; a key of the ASGI scope
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 SECURITY_HEADERS = [
     (b"x-content-type-options", b"nosniff"),
@@ -34,10 +36,12 @@ class Allowed:
     Attributes:
         hosts: names that the Host header may have (without port); this refuses DNS rebinding.
         origins: web origins that may send writing requests from a browser.
+        proxies: addresses of the proxy that stands before this service ("" for a Unix socket); None without one.
     """
 
     hosts: frozenset[str]
     origins: frozenset[str]
+    proxies: frozenset[str] | None = None
 
 
 class RequestGuard:
@@ -54,6 +58,7 @@ class RequestGuard:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
+        scope = _unwrapped(scope, self._allowed.proxies)
         headers = Headers(scope=scope)
         refusal = self._refusal(scope, headers)
         if refusal is not None and scope["type"] == "websocket":
@@ -67,6 +72,8 @@ class RequestGuard:
         await self._app(scope, _limited(receive, _most_bytes(scope)), self._sender(send))
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str, str] | None:
+        if self._allowed.proxies is not None and not scope[PROXIED] and not _is_of_this_machine(scope):
+            return 403, "only the proxy of this service may connect here", "use the address of the proxy"
         if _hostname(headers.get("host", "")) not in self._allowed.hosts:
             return 400, "this service does not have that Host name", "use the address that `panelwright serve` printed"
         writes = scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS
@@ -95,6 +102,34 @@ class RequestGuard:
             await send(message)
 
         return with_headers
+
+
+def _unwrapped(scope: Scope, proxies: frozenset[str] | None) -> Scope:
+    """Return the request as the proxy received it: host, scheme and client; those of strangers' headers do not count."""
+    client = scope.get("client")
+    if proxies is None or (client[0] if client else "") not in proxies:
+        return {**scope, PROXIED: False}
+    headers = Headers(scope=scope)
+    host, scheme, peer = (
+        headers.get(f"x-forwarded-{name}", "").rpartition(",")[2] for name in ("host", "proto", "for")
+    )
+    kept = [pair for pair in scope["headers"] if pair[0] != b"host" or not host]
+    unwrapped = {**scope, PROXIED: True, "client": (peer.strip() or "proxy", 0)}
+    if host:
+        unwrapped["headers"] = [*kept, (b"host", host.strip().encode("latin-1", "replace"))]
+    if scheme.strip() in ("http", "https"):
+        unwrapped["scheme"] = (
+            scheme.strip() if scope["type"] == "http" else {"http": "ws", "https": "wss"}[scheme.strip()]
+        )
+    return unwrapped
+
+
+def _is_of_this_machine(scope: Scope) -> bool:
+    client = scope.get("client")
+    try:
+        return client is not None and ipaddress.ip_address(client[0]).is_loopback
+    except ValueError:
+        return False
 
 
 def _most_bytes(scope: Scope) -> int:

@@ -69,6 +69,7 @@ async def info(state: State) -> InfoView:
         uptime_s=time.monotonic() - state.started_s,
         event_loop_lag_p99_s=state.metrics.lag_p99_s(),
         safety_note=SAFETY_NOTE,
+        access="open" if state.service.keys.is_open else "keys",
     )
 
 

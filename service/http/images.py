@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from starlette.responses import FileResponse, Response
 
 from service.http.problems import RESPONSES, refuse_body
-from service.http.state import AppState, State
+from service.http.state import Admitted, AppState, State
 from service.knowledge.images import MEDIA, ImageStore, StoredImage
 
 router = APIRouter(prefix="/v1/images", tags=["images"], responses=RESPONSES)
@@ -64,7 +64,7 @@ async def list_images(state: State) -> ImageList:
 
 
 @router.post("", status_code=201, summary="Store a PNG, JPEG or BMP", operation_id="store_image", openapi_extra=BODY)
-async def store_image(state: State, request: Request, response: Response) -> ImageView:
+async def store_image(state: State, _holder: Admitted, request: Request, response: Response) -> ImageView:
     """The body is the file itself: at most 32 MB, 40 megapixels, 8 bits per channel. The same image has the same id."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() not in MEDIA.values():
         # Browsers send other types across origins without a preflight request.
@@ -90,5 +90,5 @@ async def fetch_image(state: State, image_id: ImageName) -> FileResponse:
 
 
 @router.delete("/{image_id}", status_code=204, summary="Delete a stored image", operation_id="delete_image")
-async def delete_image(state: State, image_id: ImageName) -> None:
+async def delete_image(state: State, _holder: Admitted, image_id: ImageName) -> None:
     await state.in_thread(functools.partial(store_of(state).remove, image_id))

@@ -15,7 +15,7 @@ from hal.toml_text import toml_text
 from service.http.body import body_schema, strict_body
 from service.http.images import store_of
 from service.http.problems import RESPONSES
-from service.http.state import AppState, State
+from service.http.state import Admitted, AppState, State
 from service.knowledge.store import KnowledgeFile, KnowledgeStore, NoSuchKnowledge
 from service.knowledge.teach import (
     OutlineRequest,
@@ -128,7 +128,7 @@ async def outline(
     openapi_extra=body_schema(TeachRequest, TEACH_EXAMPLE, required=True),
 )
 async def teach_something(
-    state: State, request: Annotated[TeachRequest, DependsOn(strict_body(TeachRequest))]
+    state: State, _holder: Admitted, request: Annotated[TeachRequest, DependsOn(strict_body(TeachRequest))]
 ) -> TaughtView:
     taught = await state.in_thread(functools.partial(teach, store_of(state), _store(state), request))
     state.service.note("taught", {"what": taught.what, "name": taught.name, "added": taught.added})
@@ -150,7 +150,7 @@ async def show_panel_knowledge(state: State, name: PlainName) -> PanelView:
 @router.delete(
     "/{group}/{name}", status_code=204, summary="Forget a taught kind or panel", operation_id="forget_knowledge"
 )
-async def forget(state: State, group: Literal["kinds", "panels"], name: PlainName) -> None:
+async def forget(state: State, _holder: Admitted, group: Literal["kinds", "panels"], name: PlainName) -> None:
     await state.in_thread(functools.partial(_store(state).forget, group, name))
 
 

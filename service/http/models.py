@@ -47,6 +47,10 @@ class TaskView(BaseModel):
     problem: dict[str, Any] | None = None
     artefacts: list[ArtefactView] = []
     holder: str | None = None
+    by: Annotated[str | None, Field(description="name of the key that asked for it")] = None
+    sub_lease: Annotated[str | None, Field(description="its right to move: the epoch of the lease, and a number")] = (
+        None
+    )
     moves: bool = True
     created_s: Annotated[float, Field(description="wall time, seconds since 1970")]
     started_s: float | None = None
@@ -76,6 +80,8 @@ class TaskView(BaseModel):
                 for item in task.artefacts
             ],
             holder=task.holder,
+            by=task.by,
+            sub_lease=task.sub_lease.name if task.sub_lease is not None else None,
             moves=task.moves,
             created_s=task.created_s,
             started_s=task.started_s,
@@ -194,6 +200,14 @@ class LeaseRequest(Strict):
     holder: Holder
 
 
+class TakeOverRequest(LeaseRequest):
+    """The name of the client that takes the lease from its holder, and why; both are recorded."""
+
+    reason: Annotated[
+        str, Field(min_length=1, max_length=200, examples=["bob has gone home"]), AfterValidator(_printable)
+    ]
+
+
 class LeaseView(BaseModel):
     """The state of the lease. While `is_held` is false, everybody may move the arm."""
 
@@ -202,6 +216,8 @@ class LeaseView(BaseModel):
     epoch: int
     ttl_s: float
     remaining_s: float
+    sequence: Annotated[int | None, Field(description="newest number of a command under this lease; null without one")]
+    clock_s: Annotated[float, Field(description="the service's monotonic clock, for Command-Until")]
 
 
 class GrantView(LeaseView):
@@ -306,3 +322,7 @@ class InfoView(BaseModel):
     uptime_s: float
     event_loop_lag_p99_s: float
     safety_note: str
+    access: Annotated[
+        Literal["open", "keys"],
+        Field(description="open: there are no keys, so every program of this machine may move it"),
+    ]

@@ -17,7 +17,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
 from hal.errors import CellError, Retry
-from service.errors import Busy, of_file
+from service.errors import Busy, Unauthenticated, of_file
 from service.problem import problem_of, status_of
 
 MEDIA = "application/problem+json"
@@ -90,6 +90,8 @@ def problem_response(
 def error_response(error: CellError) -> ProblemResponse:
     """Return the response for a `CellError`."""
     headers = {"Retry-After": "1"} if isinstance(error, Busy) or error.retry is Retry.SAFE else None
+    if isinstance(error, Unauthenticated):
+        headers = {"WWW-Authenticate": 'Bearer realm="panelwright"'}
     return ProblemResponse(json.dumps(problem_of(error)), status_code=status_of(error), headers=headers)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
 
 import uvicorn
 from starlette.types import ASGIApp
 
 GRACE_S = 2
-LOCAL_NAMES = ("127.0.0.1", "localhost", "::1")
 
 
 class _Server(uvicorn.Server):
@@ -28,13 +28,21 @@ class _Server(uvicorn.Server):
 
 
 class HttpServer:
-    """An HTTP server on a bound socket.
+    """An HTTP server on bound sockets.
 
     Args:
+        tls: files with certificate and key; None for plain HTTP.
         on_exit: called first when a signal or `stop` ends the server; stops the arm and ends the streams.
     """
 
-    def __init__(self, app: ASGIApp, listener: socket.socket, *, on_exit: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        listeners: list[socket.socket],
+        *,
+        on_exit: Callable[[str], None],
+        tls: tuple[Path, Path] | None = None,
+    ) -> None:
         config = uvicorn.Config(
             app,
             log_level="warning",
@@ -45,8 +53,11 @@ class HttpServer:
             limit_concurrency=400,
             h11_max_incomplete_event_size=65_536,
             ws_max_size=65_536,
+            proxy_headers=False,  # the guard reads them, and only those of a proxy that is named
+            ssl_certfile=tls[0] if tls is not None else None,
+            ssl_keyfile=tls[1] if tls is not None else None,
         )
-        self._listener = listener
+        self._listeners = listeners
         self._on_exit = on_exit
         self._server = _Server(config, on_exit)
         self._thread: threading.Thread | None = None
@@ -58,7 +69,7 @@ class HttpServer:
 
     def run(self) -> None:
         """Serve in this thread, which must be the main thread, until a signal or `stop`."""
-        self._server.run(sockets=[self._listener])
+        self._server.run(sockets=self._listeners)
 
     def start(self) -> None:
         """Serve in a thread of its own."""
@@ -76,13 +87,3 @@ class HttpServer:
             self._server.should_exit = True
         if self._thread is not None:
             self._thread.join(GRACE_S + 3.0)
-
-
-def names_of(host: str, port: int) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the hosts and origins under which a server on `host` and `port` is reached."""
-    hosts = {*LOCAL_NAMES, host.lower()}
-    return frozenset(hosts), frozenset(f"http://{_in_url(name)}:{port}" for name in hosts)
-
-
-def _in_url(name: str) -> str:
-    return f"[{name}]" if ":" in name else name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,11 +12,13 @@ from typing import Annotated, TypeVar
 
 from fastapi import Depends, Header, Request, WebSocket
 
+from service.access.sessions import Sessions
 from service.core import Service
 from service.errors import Busy
 from service.http.hub import Hub
 from service.http.metrics import Metrics
 from service.readings import ReadingDesk
+from service.tasks.lease import Command
 
 T = TypeVar("T")
 DEVICE_THREADS = 6
@@ -29,6 +32,9 @@ class AppState:
 
     Attributes:
         stop_url: address of the stop process; shown to clients.
+        origins: web origins of this service's own pages, which alone may use a session.
+        cookie: name of the session's cookie, which differs between services of one machine.
+        sessions: the browsers that have logged in.
         pool: threads for device reads; when silent devices fill it, further reads are refused.
         control_pool: threads for stop, cancel, reset and starting tasks, which no device read may delay.
     """
@@ -38,6 +44,9 @@ class AppState:
     hub: Hub
     metrics: Metrics
     readings: ReadingDesk
+    origins: frozenset[str] = frozenset()
+    cookie: str = "panelwright"
+    sessions: Sessions = field(default_factory=Sessions)
     started_s: float = field(default_factory=time.monotonic)
     pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(DEVICE_THREADS, "device-read"))
     control_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(CONTROL_THREADS, "control"))
@@ -53,13 +62,19 @@ class AppState:
             raise Busy(f"{self._reading} reads wait already", hint="a device may be silent: see GET /v1/devices")
         self._reading += 1  # only the event loop counts, so no lock is needed
         try:
-            return await asyncio.get_running_loop().run_in_executor(self.pool, work)
+            return await asyncio.get_running_loop().run_in_executor(self.pool, _in_this_context(work))
         finally:
             self._reading -= 1
 
     async def act(self, work: Callable[[], T]) -> T:
         """Run work that starts, stops, cancels or resets outside the event loop; no device read delays it."""
-        return await asyncio.get_running_loop().run_in_executor(self.control_pool, work)
+        return await asyncio.get_running_loop().run_in_executor(self.control_pool, _in_this_context(work))
+
+
+def _in_this_context(work: Callable[[], T]) -> Callable[[], T]:
+    """Return `work` to be run by another thread in the name of the key that acts here."""
+    context = contextvars.copy_context()
+    return lambda: context.run(work)
 
 
 def state_of(request: Request) -> AppState:
@@ -81,6 +96,41 @@ LeaseToken = Annotated[
         alias="Lease-Token", max_length=200, description="token from POST /v1/lease; needed while the lease is held"
     ),
 ]
+Sequence = Annotated[
+    int | None,
+    Header(
+        alias="Lease-Sequence",
+        ge=0,
+        lt=2**63,
+        description="number of this command; under one lease the numbers must rise, and once there is one, all need one",
+    ),
+]
+Until = Annotated[
+    float | None,
+    Header(
+        alias="Command-Until",
+        allow_inf_nan=False,
+        description="begin before this time of the service's clock (`clock_s` of GET /v1/lease), at most 10 s away, or never",
+    ),
+]
+
+
+async def command_of(lease_token: LeaseToken = None, sequence: Sequence = None, until_s: Until = None) -> Command:
+    """Return what comes with a command in its headers."""
+    return Command(token=lease_token, sequence=sequence, until_s=until_s)
+
+
+async def admit(state: State, command: Annotated[Command, Depends(command_of)]) -> str | None:
+    """Ask the lease whether a request may change something; returns the holder's name, or None when nobody holds it.
+
+    Raises:
+        LeaseError: another client holds the lease, or the command is old or came too late.
+    """
+    return state.service.lease.admit(command)
+
+
+WithCommand = Annotated[Command, Depends(command_of)]
+Admitted = Annotated[str | None, Depends(admit)]
 IdempotencyKey = Annotated[
     str | None,
     Header(

@@ -12,11 +12,14 @@ from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from hal.errors import CellError
 from hal.geometry import to_json
 from hal.motion import RobotState
+from service.access.keys import Role
+from service.http.access import caller_with, check_role
 from service.http.state import AppState, socket_state
 from service.jsonable import jsonable
 
 router = APIRouter()
 RATE_HZ = 20.0
+FIRST_MESSAGE_S = 5.0  # a listener without a key in its header has this long to send one
 MAX_CLIENTS = 100
 log = logging.getLogger(__name__)
 
@@ -89,6 +92,8 @@ async def stream(socket: WebSocket) -> None:
         await socket.close(1013, "too many listeners")
         return
     await socket.accept()
+    if socket.state.caller is None and not await _has_sent_key(socket, state):
+        return
     mailbox = sampler.join()
     watch = asyncio.create_task(_until_gone(socket))
     try:
@@ -100,6 +105,20 @@ async def stream(socket: WebSocket) -> None:
     finally:
         sampler.leave(mailbox)
         watch.cancel()
+
+
+async def _has_sent_key(socket: WebSocket, state: AppState) -> bool:
+    """Read the key from a listener's first message, `{"key": "..."}`; close the socket and return False without one."""
+    try:
+        message = await asyncio.wait_for(socket.receive_json(), FIRST_MESSAGE_S)
+        secret = message.get("key") if isinstance(message, dict) else None
+        check_role(caller_with(state, secret if isinstance(secret, str) else ""), Role.OBSERVER)
+    except WebSocketDisconnect:
+        return False
+    except (CellError, TimeoutError, ValueError, KeyError):  # not JSON, or no text message
+        await socket.close(1008, "this service needs a key, in the header or as the first message")
+        return False
+    return True
 
 
 async def _forward(socket: WebSocket, mailbox: asyncio.Queue[str]) -> None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import AsyncIterator
+from contextlib import AbstractContextManager
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.responses import FileResponse
 
+from service.access.actor import actor
 from service.http.models import TaskList, TaskView, event_data
 from service.http.problems import RESPONSES
-from service.http.state import LeaseToken, State
+from service.http.state import AppState, LeaseToken, State
 from service.http.verbs import Wait
 from service.tasks.model import Task, TaskState
 
@@ -33,8 +35,9 @@ async def list_tasks(
 @router.get("/{task_id}", summary="One task", operation_id="show_task")
 async def show_task(state: State, task_id: TaskId, wait_s: Wait = 0.0) -> TaskView:
     task = state.service.tasks.get(task_id)
-    if wait_s > 0.0:
-        await state.hub.wait_for(task, wait_s)
+    with _followed(state, task):
+        if wait_s > 0.0:
+            await state.hub.wait_for(task, wait_s)
     return TaskView.of(task)
 
 
@@ -46,6 +49,11 @@ async def cancel_task(state: State, task_id: TaskId, lease_token: LeaseToken = N
     if wait_s > 0.0:
         await state.hub.wait_for(task, wait_s)
     return TaskView.of(task)
+
+
+def _followed(state: AppState, task: Task) -> AbstractContextManager[None]:
+    """Keep a motion that has no lease of a client, as long as somebody with the key that asked for it follows it."""
+    return state.service.lease.subs.kept(task.sub_lease if task.by == actor() else None)
 
 
 def _watched(state: State, task_id: TaskId) -> Task:
@@ -67,7 +75,7 @@ async def watch_task(
     last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", max_length=20)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     seen = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
-    with state.hub.watch() as changed:
+    with state.hub.watch() as changed, _followed(state, task):
         while True:
             changed.clear()
             is_over = task.state.is_final or state.hub.is_closing  # read before the events, so that none is missed

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Response, params
+from fastapi import APIRouter, Query, Request, Response, params
 from fastapi import Depends as DependsOn
 from starlette.responses import JSONResponse
 
 from service.http.body import body_schema, strict_body
 from service.http.models import TaskView, task_view
 from service.http.problems import MEDIA, RESPONSES
-from service.http.state import IdempotencyKey, LeaseToken, State
+from service.http.state import AppState, IdempotencyKey, State, WithCommand
 from service.operations import Operation
 from service.tasks.model import Task, TaskState
 
@@ -40,17 +41,18 @@ def _add(routes: APIRouter, operation: Operation) -> None:
 
     async def start(
         state: State,
+        command: WithCommand,
+        connection: Request,
         request: Any = body,
         wait_s: Wait = 0.0,
-        lease_token: LeaseToken = None,
         idempotency_key: IdempotencyKey = None,
     ) -> Response:
         submit = functools.partial(
-            state.service.submit, operation.name, request, lease_token=lease_token, key=idempotency_key
+            state.service.submit, operation.name, request, command=command, key=idempotency_key, is_followed=True
         )
         task = await state.act(submit)
         if wait_s > 0.0:
-            await state.hub.wait_for(task, wait_s)
+            await wait_with_client(state, connection, task, wait_s)
         return answer(task)
 
     name = operation.name.replace("-", "_")
@@ -69,6 +71,27 @@ def _add(routes: APIRouter, operation: Operation) -> None:
         },
         openapi_extra=body_schema(operation.request_model, operation.example),
     )
+
+
+async def wait_with_client(state: AppState, connection: Request, task: Task, wait_s: float) -> None:
+    """Wait for the end of a task; a motion without a lease ends when the connection of the client that asked breaks."""
+    subs, sub = state.service.lease.subs, task.sub_lease
+    with subs.kept(sub):
+        ended = asyncio.ensure_future(state.hub.wait_for(task, wait_s))
+        gone = asyncio.ensure_future(_until_gone(connection))
+        try:
+            await asyncio.wait({ended, gone}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            ended.cancel()
+            gone.cancel()
+    if not task.state.is_final and gone.done() and not gone.cancelled() and sub is not None and sub.is_own:
+        reason = "its client is gone: the connection ended while it waited, and it holds no lease"
+        await state.act(functools.partial(subs.lose, [sub], reason))
+
+
+async def _until_gone(connection: Request) -> None:
+    while (await connection.receive())["type"] != "http.disconnect":
+        pass
 
 
 def answer(task: Task) -> Response:

@@ -28,6 +28,7 @@ class Operation:
         summary: one line for the API document.
         example: a body that works on the shipped cell.
         moves: whether it may move the arm (needs the lease when one is held, and excludes other motion tasks).
+        writes: whether it stores something that others see, even if nothing moves (needs the lease when one is held).
         needs: kinds of devices that it may need in addition to those of every motion (`moves`).
         is_still: returns whether a given request moves nothing although the verb may move the arm.
         check: raises `InvalidRequest`, before a task is created, for a request that is not possible in this cell.
@@ -40,6 +41,7 @@ class Operation:
     summary: str
     example: dict[str, Any] = field(default_factory=dict)
     moves: bool = True
+    writes: bool = False
     needs: tuple[DeviceKind, ...] = ()
     is_still: Callable[[Any], bool] = field(default=lambda _request: False)
     check: Callable[[Cell, Any], None] = field(default=lambda _cell, _request: None)
@@ -133,6 +135,7 @@ OPERATIONS: dict[str, Operation] = {
             result_model=results.LearnResult,
             run=_in_session("recognise", "run_learn"),
             needs=(DeviceKind.CAMERA,),
+            writes=True,
             summary="Learn what the objects of the located panel look like, for blind recognition",
             example={"move": True},
             is_still=_is_stored,
@@ -195,6 +198,7 @@ OPERATIONS: dict[str, Operation] = {
             summary="Compare a finished mission with the simulator's truth (simulated cells only)",
             example={"mission": "20261120T231502-a1b2c3"},
             moves=False,
+            writes=True,
         ),
     )
 }

@@ -101,7 +101,7 @@ def asked_of(
         server.service.world.believe_panel(_nearly(first, seed))
     panel = cell.built_panel or cell.panel
     deeds = deeds_of(seed, panel, {item.name: item for item in first.objects})
-    client = Client(url=server.url, timeout_s=120.0, is_lasting=False)
+    client = server.client(timeout_s=120.0)
     return Asked(seed=seed, server=server, client=client, panel=panel, deeds=tuple(filter(is_wanted, deeds)))
 
 

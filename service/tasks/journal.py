@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from service.access.actor import signed
 from service.errors import JournalError
 from service.tasks.journal_parts import HEAD_SCHEMA, INSERT_ROW, SCHEMA, key_of, parts_of, snapshot, write_part
 from service.tasks.journal_reader import DROPPED, FIRST_HASH, Record, chain_hash, read_records, seal, verify_chain
@@ -109,7 +110,7 @@ class Journal:
             raise JournalError("the journal is closed", hint="restart the service")
         entry = _Entry(
             kind=kind,
-            text=json.dumps(data, separators=(",", ":"), allow_nan=False),
+            text=json.dumps(signed(data), separators=(",", ":"), allow_nan=False),
             wall_time_s=time.time(),
             monotonic_s=time.monotonic(),
             done=done,

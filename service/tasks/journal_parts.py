@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from hal.atomic_write import NEW
+from hal.atomic_write import NEW, flush_folder
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS journal (
@@ -97,9 +97,5 @@ def write_part(live: Path, rows: Iterable[Row], *, first_id: int, last_id: int) 
         fresh.replace(path)
     finally:
         fresh.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)  # the new name is durable only after its folder is flushed
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    flush_folder(path.parent)
     return path

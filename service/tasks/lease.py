@@ -1,4 +1,7 @@
-"""The lease, which gives one client the right to move the arm; it has an epoch that rises with each grant, and it expires."""
+"""The lease, which gives one client the right to move the arm; it has an epoch that rises with each grant, and it expires.
+
+A command may have a number, which must rise while the lease is held, and a time until which it may begin.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,10 @@ from typing import Any
 
 from hal.clock import Clock, WallClock
 from hal.errors import LeaseError
-from service.errors import StaleEpoch
+from service.errors import Expired, StaleEpoch, StaleSequence, TooDistant
+from service.tasks.sub_leases import SubLease, SubLeases
+
+HORIZON_S = 10.0  # a command that may begin later than this was not meant for now
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,12 +30,29 @@ class Grant:
     remaining_s: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """What comes with a command.
+
+    Attributes:
+        token: of the lease; None from a client without one.
+        sequence: must be greater than that of every earlier command under the same lease; None for a client that does not
+            count.
+        until_s: the command begins before this time of the service's monotonic clock, or not at all; None for no limit.
+    """
+
+    token: str | None = None
+    sequence: int | None = None
+    until_s: float | None = None
+
+
 class LeaseDesk:
     """Grants, renews, checks and ends the lease, on the monotonic clock.
 
     Args:
         ttl_s: the lease lapses after this time without a heartbeat.
-        on_loss: called with a reason when a holder loses the lease by lapse or take-over; stops the holder's tasks.
+        on_loss: called with a reason when a holder loses the lease by lapse or take-over, after the holder's tasks were
+            stopped.
         others: returns a sentence about a motion task (running or queued) that this holder did not start, or None.
         report: called for each lapse.
         commit: called before each grant, take-over and release, which do not happen when it raises.
@@ -52,6 +75,8 @@ class LeaseDesk:
         self._report = report
         self._commit = commit
         self._lock = threading.RLock()
+        self.subs = SubLeases(self._clock)
+        self._sequence: int | None = None
         self._epoch = 0
         self._holder: str | None = None
         self._token = ""
@@ -80,15 +105,83 @@ class LeaseDesk:
                 )
             return self._grant(holder, "lease-acquired")
 
-    def take_over(self, holder: str) -> Grant:
+    def take_over(self, holder: str, *, reason: str = "") -> Grant:
         """Take the lease from its holder; tasks of that holder, and of clients without a lease, are stopped."""
         self.expire()
         with self._lock:
             before, moving = self._holder, self._others(holder)
-            grant = self._grant(holder, "lease-taken-over")
+            grant = self._grant(holder, "lease-taken-over", **({"reason": reason} if reason else {}))
+            lent = self.subs.all()
         if before is not None or moving is not None:
-            self._on_loss(f"{holder} took the lease over" + (f" from {before}" if before is not None else ""))
+            why = f"{holder} took the lease over" + (f" from {before}" if before is not None else "")
+            self._lose(lent, f"{why}: {reason}" if reason else why)
         return grant
+
+    def admit(self, command: Command) -> str | None:
+        """Check a command and count it; returns the holder's name, or None when nobody holds the lease.
+
+        Raises:
+            LeaseError, StaleEpoch: as for `check`.
+            StaleSequence: this or a later command came before.
+            Expired, TooDistant: its time has passed, or is further away than a command may wait.
+        """
+        with self._lock:
+            holder = self.check(command.token)
+            self.check_in_time(command)
+            if command.sequence is None and self._sequence is not None:
+                raise StaleSequence(
+                    "the commands of this lease are numbered, and this one has no number",
+                    hint="send Lease-Sequence with every command",
+                    newest=self._sequence,
+                )
+            if command.sequence is not None and holder is not None:
+                if self._sequence is not None and command.sequence <= self._sequence:
+                    raise StaleSequence(
+                        f"command {command.sequence} came after command {self._sequence}, so it is old or a repeat",
+                        hint="number the commands of a lease upwards; to repeat one, use an Idempotency-Key",
+                        newest=self._sequence,
+                    )
+                self._sequence = command.sequence
+            return holder
+
+    def check_in_time(self, command: Command) -> None:
+        """Raise `Expired` or `TooDistant` unless the command may begin now."""
+        if command.until_s is None:
+            return
+        left_s = command.until_s - self._clock.now_s()
+        if left_s < 0.0:
+            raise Expired(
+                f"EXPIRED: the command was to begin {-left_s:.3f} s ago at the latest",
+                hint="look at the cell, then command again",
+                late_s=round(-left_s, 3),
+            )
+        if left_s > HORIZON_S:
+            raise TooDistant(
+                f"TOO_DISTANT: the command may begin in {left_s:.3f} s; {HORIZON_S:g} s are allowed",
+                hint="Command-Until is `clock_s` of GET /v1/lease and at most 10 s; did the service restart?",
+                early_s=round(left_s - HORIZON_S, 3),
+            )
+
+    def lend(self, *, is_own: bool) -> SubLease:
+        """Return a sub-lease for one task; `is_own`: a client without a lease must keep it."""
+        with self._lock:
+            return self.subs.lend(self._epoch, is_own=is_own)
+
+    def clock_s(self) -> float:
+        """Return the time on the monotonic clock, by which commands say how long they may wait."""
+        return self._clock.now_s()
+
+    def newest_sequence(self) -> int | None:
+        """Return the number of the newest numbered command of this lease; None without one."""
+        return self._sequence
+
+    def soonest_s(self) -> float:
+        """Return the seconds until the lease or a sub-lease may end; infinite when none can."""
+        with self._lock:
+            ends_s = [self._ends_s] if self._holder is not None else []
+        own_s = self.subs.soonest_s()
+        ends_s += [own_s] if own_s is not None else []
+        return max(0.0, min(ends_s) - self._clock.now_s()) if ends_s else float("inf")
 
     def heartbeat(self, token: str) -> Grant:
         """Renew the lease.
@@ -145,17 +238,25 @@ class LeaseDesk:
             return self._holder, self._epoch, left_s
 
     def expire(self) -> None:
-        """End the lease if its heartbeat is overdue; called before every decision and by a timer."""
+        """End the lease if its heartbeat is overdue, and sub-leases that nobody keeps; called before every decision."""
+        self.subs.expire()
         with self._lock:
             if self._holder is None or self._clock.now_s() < self._ends_s:
                 return
             lost, self._holder, self._token = self._holder, None, ""
             self._report("lease-lapsed", {"holder": lost, "epoch": self._epoch})
-        self._on_loss(f"the lease of {lost} lapsed: no heartbeat for {self.ttl_s:g} s")
+            lent = self.subs.all()
+        self._lose(lent, f"the lease of {lost} lapsed: no heartbeat for {self.ttl_s:g} s")
 
-    def _grant(self, holder: str, kind: str) -> Grant:
-        self._commit(kind, {"holder": holder, "before": self._holder, "epoch": self._epoch + 1})
+    def _lose(self, lent: list[SubLease], reason: str) -> None:
+        """Stop the tasks that had these sub-leases; those of a new holder have others and go on."""
+        self.subs.lose(lent, reason)
+        self._on_loss(reason)
+
+    def _grant(self, holder: str, kind: str, **told: str) -> Grant:
+        self._commit(kind, {"holder": holder, "before": self._holder, "epoch": self._epoch + 1, **told})
         self._epoch += 1
+        self._sequence = None
         self._holder = holder
         self._token = f"{self._epoch}.{secrets.token_urlsafe(16)}"
         self._ends_s = self._clock.now_s() + self.ttl_s

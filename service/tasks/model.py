@@ -11,6 +11,7 @@ from enum import StrEnum
 from typing import Any
 
 from service.problem import ProblemFields
+from service.tasks.sub_leases import SubLease
 
 MAX_EVENTS = 2000  # a task that reports more than this drops its oldest events; their sequence numbers show the gap
 
@@ -77,7 +78,9 @@ class Task:
     Attributes:
         moves: whether it may move the arm.
         holder: who held the lease when it was started.
+        by: name of the key that asked for it; None while the service has no keys.
         key: the caller's idempotency key.
+        sub_lease: its right to move; None when it does not move, and for a task of an earlier run.
         problem: why it failed, as plain values.
         created_s, started_s, ended_s: wall time, for display only.
     """
@@ -87,7 +90,9 @@ class Task:
     request: dict[str, Any]
     moves: bool
     holder: str | None = None
+    by: str | None = None
     key: str | None = None
+    sub_lease: SubLease | None = None
     state: TaskState = TaskState.QUEUED
     result: Any = None
     problem: ProblemFields | None = None

@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from hal.errors import Cancelled, CellError, InvalidRequest
+from service.access.actor import actor
 from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow, of_file
 from service.jsonable import jsonable
 from service.problem import problem_of
 from service.tasks.model import Artefact, Task, TaskEvent, TaskState
+from service.tasks.sub_leases import SubLease
 
 __all__ = ["Artefact", "Task", "TaskContext", "TaskEvent", "TaskRecorder", "TaskState", "TaskStore"]
 
@@ -133,6 +135,7 @@ class TaskStore:
         moves: bool,
         holder: str | None = None,
         key: str | None = None,
+        sub_lease: SubLease | None = None,
     ) -> Task:
         """Queue a task; the same idempotency `key` with the same request returns the same task again.
 
@@ -147,12 +150,13 @@ class TaskStore:
                 return earlier
             self._check_room()
             task = Task(id=secrets.token_hex(8), verb=verb, request=request, moves=moves, holder=holder, key=key)
-            task.on_change = self._changed
+            task.by, task.sub_lease, task.on_change = actor(), sub_lease, self._changed
             self._tasks[task.id] = task
             forgotten = self._forget_old()
         self._remove_artefacts(forgotten)
         try:
             asked = {"task": task.id, "verb": verb, "request": request, "holder": holder, "key": key}
+            asked |= {"sub_lease": sub_lease.name} if sub_lease is not None else {}
             self._recorder.append("task-queued", asked)
         except CellError:
             with self._lock:
@@ -161,6 +165,10 @@ class TaskStore:
         task.add_event("state")
         self._lanes[moves].submit(self._run, task, work)
         return task
+
+    def has_key(self, key: str) -> bool:
+        """Return whether a kept task was asked for with this idempotency key."""
+        return any(task.key == key for task in self.all())
 
     def restore(self, task: Task) -> None:
         """Add a task of an earlier service run, for reading only; one that had not ended counts as aborted."""

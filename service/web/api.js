@@ -14,10 +14,16 @@ export class ProblemError extends Error {
 // Replaces a browser's "Failed to fetch", which does not say what to do.
 export async function ask(path, options) {
   try {
-    return await fetch(path, options);
+    return toLogIn(await fetch(path, options));
   } catch {
     throw new ProblemError({ detail: "The service does not answer", hint: "Is panelwright serve still running?" }, 0);
   }
+}
+
+// A service with keys answers 401 before the browser has logged in, or after its session has ended.
+export function toLogIn(response) {
+  if (response.status === 401) location.assign(`/login.html?next=${encodeURIComponent(location.pathname)}`);
+  return response;
 }
 
 export async function get(path) {

@@ -1,5 +1,5 @@
 // Starts the parts of the page and shows when the service cannot be reached.
-import { insist, repeat } from "./api.js";
+import { get, insist, remove, repeat, toLogIn } from "./api.js";
 import { startDevices } from "./devices.js";
 import { startLive } from "./live.js";
 import { startMission } from "./mission.js";
@@ -13,9 +13,21 @@ function describe(info) {
   document.querySelector("#cell-line").textContent = `cell ${info.cell} · ${where} · panel ${info.panel} · seed ${info.seed}`;
 }
 
+// Shows who may use the service, and who uses it here.
+async function showAccess() {
+  const session = await get("/v1/session");
+  const isOpen = session.access === "open";
+  document.querySelector("#access-line").textContent = isOpen
+    ? "No keys: every program of this computer may move the arm."
+    : `Key ${session.name} (${session.role}).`;
+  document.querySelector("#log-out").hidden = isOpen;
+}
+
+document.querySelector("#log-out").addEventListener("click", () => remove("/v1/session").then(() => location.assign("/login.html")));
+
 async function watchService() {
   try {
-    const response = await fetch("/readyz", { cache: "no-store" });
+    const response = toLogIn(await fetch("/readyz", { cache: "no-store" }));
     const ready = await response.json();
     const sick = ready.processes.find((process) => process.detail) || {};
     document.body.classList.remove("lost");
@@ -35,6 +47,7 @@ startStop(asked.then((info) => info.stop_url));
 repeat(watchService, () => 2000);
 const info = await asked;
 describe(info);
+showAccess().catch(() => {});
 startMission(info.verbs);
 startDevices();
 startView();

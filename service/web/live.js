@@ -12,7 +12,7 @@ export function startLive() {
 }
 
 function connect() {
-  const socket = new WebSocket(`ws://${location.host}/v1/stream`);
+  const socket = new WebSocket(`${location.protocol.replace("http", "ws")}//${location.host}/v1/stream`);
   socket.onmessage = (message) => (newest = JSON.parse(message.data));
   socket.onclose = () => {
     newest = null;

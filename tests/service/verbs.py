@@ -130,6 +130,15 @@ OPERATIONS = {
             example={"seconds": 0.1},
         ),
         Operation(
+            name="note",
+            request_model=EchoRequest,
+            result_model=EchoResult,
+            run=echo,
+            summary="Note",
+            moves=False,
+            writes=True,
+        ),
+        Operation(
             name="fail",
             request_model=FailRequest,
             result_model=HoldResult,

@@ -232,7 +232,7 @@ def test_a_holder_may_have_any_name_that_can_be_shown(client: httpx2.Client) -> 
 def test_a_take_over_ends_what_the_old_holder_started(client: httpx2.Client) -> None:
     alice = client.post("/v1/lease", json={"holder": "alice"}).json()
     where = client.post("/v1/hold", json={}, headers={"Lease-Token": alice["token"]}).headers["location"]
-    bob = client.post("/v1/lease/take-over", json={"holder": "bob"}).json()
+    bob = client.post("/v1/lease/take-over", json={"holder": "bob", "reason": "alice has left"}).json()
     assert bob["epoch"] > alice["epoch"]
     task = client.get(f"{where}?wait_s=10").json()
     assert task["state"] == "cancelled"
@@ -249,7 +249,7 @@ def test_who_takes_the_lease_does_not_share_the_arm_with_a_task_that_was_begun_w
     assert (refused.status_code, refused.json()["type"]) == (409, "urn:panelwright:lease-error")
     assert where.rpartition("/")[2] in refused.json()["detail"]
     assert not client.get("/v1/lease").json()["is_held"]
-    bob = client.post("/v1/lease/take-over", json={"holder": "bob"}).json()
+    bob = client.post("/v1/lease/take-over", json={"holder": "bob", "reason": "alice has left"}).json()
     task = client.get(f"{where}?wait_s=10").json()
     assert (task["state"], "bob took the lease over" in task["problem"]["detail"]) == ("cancelled", True)
     again = client.post("/v1/hold", json={}, headers={"Lease-Token": bob["token"]}).headers["location"]
@@ -328,7 +328,7 @@ def test_missions_are_sorted_by_when_they_began_not_by_when_their_files_were_tou
 def test_info_and_readiness(client: httpx2.Client, served: Panelwright) -> None:
     assert client.get("/readyz").json()["is_ready"]
     info = client.get("/v1/info").json()
-    assert info["verbs"] == ["echo", "hold", "wait", "fail", "measure"]
+    assert info["verbs"] == ["echo", "hold", "wait", "note", "fail", "measure"]
     assert info["stop_url"] == served.stop_url
     assert "not a safety function" in info["safety_note"]
     assert "panelwright_event_loop_lag_seconds_bucket" in client.get("/metrics").text

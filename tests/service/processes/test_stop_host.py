@@ -15,7 +15,7 @@ import pytest
 from hal.child_python import module_command
 from hal.errors import MotionRefused
 from service.processes.latch import Latch
-from service.processes.stop_host import ProcessStop
+from service.processes.stop_host import ProcessStop, bound_socket
 from tests.service.waiting import eventually
 
 
@@ -88,6 +88,14 @@ def test_a_stop_process_without_its_supervisor_latches_and_ends(latch: Latch, tm
         process.stdout.close()
     assert latch.is_set()
     assert latch.state().source == "the service is gone"
+
+
+def test_answers_do_not_wait_for_the_acknowledgement_of_their_first_packet() -> None:
+    """Head and body of an answer are two packets; with Nagle's algorithm each answer took 40 ms longer."""
+    with bound_socket("127.0.0.1", 0) as listener, socket.create_connection(listener.getsockname()):
+        accepted, _ = listener.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
 
 
 def _pid(host: ProcessStop) -> int:

@@ -16,6 +16,7 @@ from hal.motion import Hold
 from service.core import Service
 from service.operations import Operation, OperationContext
 from service.serve import Options, Panelwright
+from service.tasks.lease import Command
 from service.tasks.model import Task, TaskState
 from tests.service.conftest import WriteCell
 from tests.service.verbs import OPERATIONS, HoldRequest, HoldResult
@@ -106,7 +107,7 @@ def test_a_take_over_at_the_very_moment_of_a_command_wins(service: Service) -> N
 
     alice = service.lease.acquire("alice")
     with pytest.raises(LeaseError):
-        service.submit("hold", Overtaken(), lease_token=alice.token)
+        service.submit("hold", Overtaken(), command=Command(token=alice.token))
     assert service.tasks.all()[0].wait(PATIENCE_S)
     assert service.tasks.all()[0].state is TaskState.CANCELLED
 

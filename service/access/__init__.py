@@ -1,0 +1,1 @@
+"""Keys of the API: who may use it, in which role, and in whose name something is recorded."""

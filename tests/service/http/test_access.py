@@ -1,0 +1,258 @@
+"""Every call against every role: the table is complete, and the service answers as the table says."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+import websockets.exceptions
+from fastapi.routing import APIRoute, APIWebSocketRoute
+from starlette.routing import BaseRoute
+from websockets.sync.client import connect
+
+from hal.config import load_cell
+from service.access.keys import Role
+from service.core import Service
+from service.http.app import create_app
+from service.http.guard import Allowed, RequestGuard
+from service.http.permissions import TABLE, Asks, row_of
+from service.operations import OPERATIONS
+from service.serve import Options, Panelwright
+from tests.service.conftest import WriteCell
+
+ROLES = (None, *Role)
+PLACE = {"{name}": "arm", "{task_id}": "none", "{image_id}": "0" * 24, "{mission}": "none", "{group}": "kinds"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guarded:
+    """A service with a key for each role."""
+
+    server: Panelwright
+    keys: dict[Role, str]
+
+    def headers(self, role: Role | None) -> dict[str, str]:
+        return {} if role is None else {"Authorization": f"Bearer {self.keys[role]}"}
+
+    def rows(self, kind: str) -> list[dict[str, Any]]:
+        return [record.data for record in self.server.service.journal.records(kinds=(kind,))]
+
+
+@pytest.fixture(scope="module")
+def guarded(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), inline=True)
+    server = Panelwright(load_cell(write_module_cell(robot=True)), options, operations=OPERATIONS)
+    book, commit = server.service.keys, server.service.commit
+    keys = {role: book.add(f"the-{role}", role, valid_s=None, commit=commit) for role in Role}
+    server.start()
+    yield Guarded(server=server, keys=keys)
+    server.close()
+
+
+@pytest.fixture
+def http(guarded: Guarded) -> Iterator[httpx2.Client]:
+    with httpx2.Client(base_url=guarded.server.url, timeout=10.0, trust_env=False) as client:
+        yield client
+
+
+def calls_of(routes: Iterable[BaseRoute]) -> set[str]:
+    """Return all calls of routes and of the routers among them, as the table names them."""
+    found = set()
+    for route in routes:
+        inner = getattr(route, "original_router", None)
+        if inner is not None:
+            found |= calls_of(inner.routes)
+        if isinstance(route, APIRoute):
+            found |= {f"{method} {route.path}" for method in route.methods}
+        if isinstance(route, APIWebSocketRoute):
+            found.add(f"WS {route.path}")
+    return found
+
+
+def test_every_call_has_a_row_and_every_row_a_call(write_cell: WriteCell, tmp_path: Path) -> None:
+    service = Service(load_cell(write_cell(robot=True)), OPERATIONS, runs_dir=tmp_path / "runs", inline=True)
+    try:
+        allowed = Allowed(hosts=frozenset(), origins=frozenset())
+        guard = create_app(service, allowed=allowed, stop_url="")
+        assert isinstance(guard, RequestGuard)
+        assert calls_of(guard.inner.routes) == set(TABLE), (
+            "add the call to service/http/permissions.py, or take its row out"
+        )
+    finally:
+        service.close()
+
+
+def test_a_call_without_a_row_needs_a_maintainer() -> None:
+    assert row_of("POST", "/v1/forgotten").role is Role.MAINTAINER
+
+
+def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
+    free = {call for call, row in TABLE.items() if row.asks is Asks.NOTHING and not call.startswith(("GET ", "WS "))}
+    assert free == {
+        "POST /v1/stop",  # ending is always allowed
+        "POST /v1/tasks/{task_id}/cancel",
+        "POST /v1/session",  # about the caller alone
+        "DELETE /v1/session",
+        "POST /v1/knowledge/outline",  # writes nothing
+        "POST /v1/read-photograph",
+    }
+
+
+def asked(http: httpx2.Client, call: str, headers: dict[str, str]) -> int:
+    """Send a call with a body that no call accepts, so that nothing happens; returns the status."""
+    method, _, path = call.partition(" ")
+    path = re.sub(r"\{\w+\}", lambda found: PLACE[found[0]], path)
+    media = "image/png" if call == "POST /v1/images" else "application/json"
+    content = b"[" if method in ("POST", "PUT") else None
+    if method == "WS":
+        return socket_status(http, headers)
+    if call.endswith("/events"):
+        path = path.replace("none", "no-such-task")
+    return http.request(method, path, content=content, headers={**headers, "Content-Type": media}).status_code
+
+
+def socket_status(http: httpx2.Client, headers: dict[str, str]) -> int:
+    url = f"{str(http.base_url).replace('http', 'ws').rstrip('/')}/v1/stream"
+    with suppress(websockets.exceptions.WebSocketException), connect(url, additional_headers=headers) as socket:
+        if "Authorization" not in headers:
+            socket.send('{"key": "pw_wrong"}')
+        socket.recv(timeout=5.0)
+        return 200
+    return 401
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_each_role_may_do_what_the_table_says_and_nothing_else(
+    http: httpx2.Client, guarded: Guarded, role: Role | None
+) -> None:
+    wrong = {}
+    for call, row in TABLE.items():
+        status = asked(http, call, guarded.headers(role))
+        if row.role is None or (row.is_free_here and role is None) or (role is not None and role.permits(row.role)):
+            is_right = status not in (401, 403) or (status == 401 and call == "POST /v1/session")
+        else:
+            is_right = status == (401 if role is None else 403)
+        if not is_right:
+            wrong[call] = status
+    assert wrong == {}
+    assert not guarded.server.service.tasks.all(), "no refused or broken call starts anything"
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Authorization": "Bearer pw_wrong"},
+        {"Authorization": "Bearer"},
+        {"Authorization": "Basic YTpi"},
+        {"Authorization": "pw_wrong"},
+        {"Cookie": "{cookie}=guessed"},
+    ],
+)
+def test_a_wrong_key_opens_nothing(http: httpx2.Client, guarded: Guarded, headers: dict[str, str]) -> None:
+    cookie = f"panelwright_{guarded.server.port}"
+    sent = {name: value.format(cookie=cookie) for name, value in headers.items()}
+    closed = [call for call, row in TABLE.items() if row.role is not None and not row.is_free_here]
+    statuses = {asked(http, call, sent) for call in closed if not call.startswith("WS")}
+    assert statuses == {401}
+    answer = http.get("/v1/tasks", headers=sent)
+    assert answer.headers["www-authenticate"].startswith("Bearer") and "pw_wrong" not in answer.text
+
+
+def test_a_key_in_the_address_or_in_another_cookie_is_none(http: httpx2.Client, guarded: Guarded) -> None:
+    key = guarded.keys[Role.MAINTAINER]
+    assert http.get(f"/v1/tasks?key={key}").status_code == 401
+    assert http.get("/v1/tasks", headers={"Cookie": f"panelwright_{guarded.server.port}={key}"}).status_code == 401
+
+
+def test_a_revoked_key_ends_at_once(http: httpx2.Client, guarded: Guarded) -> None:
+    book, commit = guarded.server.service.keys, guarded.server.service.commit
+    key = {"Authorization": f"Bearer {book.add('guest', Role.OBSERVER, valid_s=None, commit=commit)}"}
+    assert http.get("/v1/tasks", headers=key).status_code == 200
+    book.revoke("guest", commit=commit)
+    assert http.get("/v1/tasks", headers=key).status_code == 401
+
+
+def test_the_stop_needs_no_key_on_this_machine_and_its_reset_tells_whose_key(
+    http: httpx2.Client, guarded: Guarded
+) -> None:
+    assert http.post("/v1/stop").json()["is_latched"]
+    count = http.post("/v1/stop", headers=guarded.headers(Role.OBSERVER)).json()["count"]
+    assert guarded.rows("stop")[-1]["by"] == "the-observer"
+    assert http.post("/v1/stop/reset", json={"seen_count": count}).status_code == 401
+    done = http.post("/v1/stop/reset", json={"seen_count": count}, headers=guarded.headers(Role.OPERATOR))
+    assert done.status_code == 200
+    assert guarded.rows("stop-reset")[-1]["by"] == "the-operator"
+
+
+def test_the_journal_and_the_task_tell_whose_key_asked(http: httpx2.Client, guarded: Guarded) -> None:
+    answer = http.post("/v1/judge?wait_s=10", json={"mission": "none"}, headers=guarded.headers(Role.OPERATOR))
+    assert answer.status_code >= 400  # there is no such mission; the task was recorded before
+    assert guarded.rows("task-queued")[-1]["by"] == "the-operator"
+    grant = http.post("/v1/lease", json={"holder": "x"}, headers=guarded.headers(Role.OPERATOR)).json()
+    token = {"Lease-Token": grant["token"], **guarded.headers(Role.OPERATOR)}
+    assert http.post("/v1/lease/release", headers=token).status_code == 200
+    assert guarded.rows("lease-acquired")[-1]["by"] == "the-operator"
+    guarded.server.service.tasks._tasks.clear()
+
+
+def log_in(http: httpx2.Client, key: str) -> str:
+    answer = http.post("/v1/session", json={"key": key})
+    assert answer.status_code == 200
+    header = answer.headers["set-cookie"]
+    assert "httponly" in header.lower() and "samesite=strict" in header.lower() and key not in header
+    http.cookies.clear()
+    return header.partition(";")[0]
+
+
+def test_a_browser_logs_in_for_a_cookie_that_only_its_own_page_may_use(http: httpx2.Client, guarded: Guarded) -> None:
+    cookie = {"Cookie": log_in(http, guarded.keys[Role.OPERATOR])}
+    own = {**cookie, "Origin": guarded.server.url}
+    assert http.get("/v1/session", headers=cookie).json() == {
+        "access": "keys",
+        "name": "the-operator",
+        "role": "operator",
+    }
+    assert http.get("/v1/tasks", headers=cookie).status_code == 200
+    assert http.post("/v1/lease", json={"holder": "x"}, headers=cookie).status_code == 401, "no origin"
+    strange = {**cookie, "Origin": "http://127.0.0.1:1"}
+    assert http.post("/v1/lease", json={"holder": "x"}, headers=strange).status_code == 403
+    token = http.post("/v1/lease", json={"holder": "x"}, headers=own).json()["token"]
+    assert http.post("/v1/lease/release", headers={**own, "Lease-Token": token}).status_code == 200
+    assert http.put("/v1/devices/arm", json={"driver": "fake:arm"}, headers=own).status_code == 403
+    assert http.delete("/v1/session", headers=own).status_code == 200
+    assert http.get("/v1/tasks", headers=cookie).status_code == 401
+
+
+def test_a_wrong_key_does_not_log_in(http: httpx2.Client) -> None:
+    answer = http.post("/v1/session", json={"key": "pw_wrong"})
+    assert answer.status_code == 401 and "set-cookie" not in answer.headers
+
+
+def test_a_stream_takes_the_key_in_the_header_or_as_its_first_message(guarded: Guarded) -> None:
+    url = f"{guarded.server.url.replace('http', 'ws')}/v1/stream"
+    with connect(url, additional_headers=guarded.headers(Role.OBSERVER)) as socket:
+        assert "position_rad" in str(socket.recv(timeout=5.0))
+    with connect(url) as socket:
+        socket.send(f'{{"key": "{guarded.keys[Role.OBSERVER]}"}}')
+        assert "position_rad" in str(socket.recv(timeout=5.0))
+    for said in ('{"key": "pw_wrong"}', '{"key": 5}', "[]", "no json"):
+        with connect(url) as socket:
+            socket.send(said)
+            with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
+                socket.recv(timeout=5.0)
+            assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+
+
+def test_without_keys_everybody_here_may_and_the_page_says_so(client: httpx2.Client) -> None:
+    assert client.get("/v1/session").json() == {"access": "open", "name": None, "role": "maintainer"}
+    assert client.get("/v1/info").json()["access"] == "open"
+
+
+def test_a_program_uses_its_own_key_for_its_own_service(guarded: Guarded) -> None:
+    assert guarded.server.client().get("/v1/info")["access"] == "keys"

@@ -43,7 +43,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import alarms, calibrate, devices, init, keys, tasks
+    from service.commands import alarms, calibrate, devices, init, keys, serve, tasks
     from service.commands.chaos import chaos
     from service.commands.check import check
     from service.commands.demo import demo
@@ -57,7 +57,6 @@ def _app() -> Callable[[], None]:
     from service.commands.range import batch, range_image
     from service.commands.read import read
     from service.commands.record import record, replay
-    from service.commands.serve import serve
     from service.commands.sweep import sweep
     from service.commands.teach import teach
     from service.commands.version import root
@@ -71,7 +70,7 @@ def _app() -> Callable[[], None]:
 
     app.callback()(root)
     app.add_typer(init.app)  # without a name of its own, so it is one command
-    app.command()(serve)
+    app.add_typer(serve.app)  # as `init`
     app.command()(demo)
     app.command()(record)
     app.command()(replay)

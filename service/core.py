@@ -17,9 +17,9 @@ from pydantic import BaseModel
 from hal.caller import calling_as
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
-from service.alarms.desk import AlarmDesk
 from service.access.keys import FILE as KEYS_FILE
 from service.access.keys import KeyBook
+from service.alarms.desk import AlarmDesk
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.history.observer import Observations
@@ -284,6 +284,7 @@ class Service:
         """Let the alarms' time pass, in a thread of its own because each change waits for the disk."""
         while not self._is_closing.wait(ALARMS_S):
             self.alarms.tick()
+
     def _watch_lease(self) -> None:
         """End the lease at the moment at which its heartbeat is overdue; a thread of its own, so that no record delays it."""
         while not self._is_closing.wait(min(LOOK_S, self.lease.soonest_s())):

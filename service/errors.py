@@ -75,6 +75,8 @@ class JournalError(CellError):
 
 class HistoryError(CellError):
     """The history of readings cannot be written, so no reading may be reported; or it cannot be read."""
+
+
 class Unauthenticated(CellError):
     """The service has keys, and the request came without a valid one."""
 

@@ -19,6 +19,6 @@ def actor() -> str | None:
 
 
 def signed(data: dict[str, Any]) -> dict[str, Any]:
-    """Return what is recorded with the name of the key that acts, as `by`; unchanged when no key acts."""
+    """Return what is recorded with the name of the key that acts, as `key_name`; unchanged when no key acts."""
     name = _actor.get()
-    return data if name is None else {**data, "by": name}
+    return data if name is None else {**data, "key_name": name}

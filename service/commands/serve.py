@@ -20,8 +20,29 @@ if TYPE_CHECKING:
     from service.serve import Panelwright
 
 START_PATIENCE_S = 120.0
+app = typer.Typer()
+Host = Annotated[
+    str, typer.Option(help="Address to listen on; any other than loopback needs keys, and TLS or a proxy.")
+]
+Names = Annotated[
+    list[str] | None,
+    typer.Option("--name", help="A further name under which clients reach it; may be given several times."),
+]
+TlsCert = Annotated[Path | None, typer.Option(help="Certificate (PEM), with the chain.")]
+TlsKey = Annotated[Path | None, typer.Option(help="Private key of the certificate (PEM).")]
+BehindProxy = Annotated[
+    bool,
+    typer.Option(
+        "--behind-proxy", help="A proxy with TLS stands before it; needs --name, and --proxy or --unix-socket."
+    ),
+]
+Proxies = Annotated[
+    list[str] | None, typer.Option("--proxy", help="IP address of that proxy; may be given several times.")
+]
+UnixSocket = Annotated[Path | None, typer.Option(help="A socket for that proxy, beside the port.")]
 
 
+@app.command()
 def serve(
     *,
     cell: CellOption = DEFAULT_CELL,
@@ -29,21 +50,13 @@ def serve(
     stop_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Port of the stop process; the port after --port if not given.")
     ] = None,
-    host: Annotated[
-        str, typer.Option(help="Address to listen on; any other than loopback needs keys, and TLS or a proxy.")
-    ] = "127.0.0.1",
-    name: Annotated[
-        list[str] | None, typer.Option(help="A further name under which clients reach it; may be given several times.")
-    ] = None,
-    tls_cert: Annotated[Path | None, typer.Option(help="Certificate (PEM), with the chain.")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="Private key of the certificate (PEM).")] = None,
-    behind_proxy: Annotated[
-        bool, typer.Option("--behind-proxy", help="A proxy with TLS stands before it; needs --name and --proxy.")
-    ] = False,
-    proxy: Annotated[
-        list[str] | None, typer.Option(help="IP address of that proxy; may be given several times.")
-    ] = None,
-    unix_socket: Annotated[Path | None, typer.Option(help="A socket for that proxy, beside the port.")] = None,
+    host: Host = "127.0.0.1",
+    name: Names = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    behind_proxy: BehindProxy = False,
+    proxy: Proxies = None,
+    unix_socket: UnixSocket = None,
     runs: Annotated[Path, typer.Option(help="Folder for reports, journal and artefacts.")] = Path("runs"),
     seed: SeedOption = None,
     warm: Annotated[bool, typer.Option(help="Load the compiled kernels right after the start.")] = True,

@@ -32,6 +32,7 @@ class Row:
 EVERYBODY = Row(role=None)
 OBSERVER = Row(role=Role.OBSERVER)
 OPERATOR = Row(role=Role.OPERATOR)
+MAINTAINER = Row(role=Role.MAINTAINER)
 OPERATOR_WRITES = Row(role=Role.OPERATOR, asks=Asks.LEASE)
 MAINTAINER_WRITES = Row(role=Role.MAINTAINER, asks=Asks.LEASE)
 OPERATOR_TASK = Row(role=Role.OPERATOR, asks=Asks.ITS_TASK)
@@ -63,6 +64,11 @@ TABLE: dict[str, Row] = {
     "GET /v1/panel": OBSERVER,
     "GET /v1/missions": OBSERVER,
     "GET /v1/missions/{mission}/{name}": OBSERVER,
+    "GET /v1/history": OBSERVER,
+    "GET /v1/history/export": OBSERVER,
+    "GET /v1/history/{object}": OBSERVER,
+    "GET /v1/history/{object}/crops/{crop}": OBSERVER,
+    "GET /v1/alarms": OBSERVER,
     "GET /v1/images": OBSERVER,
     "GET /v1/images/{image_id}": OBSERVER,
     "GET /v1/calibrations": OBSERVER,
@@ -80,6 +86,11 @@ TABLE: dict[str, Row] = {
     "POST /v1/devices/{name}/connect": OPERATOR_WRITES,
     "POST /v1/images": OPERATOR_WRITES,
     "DELETE /v1/images/{image_id}": OPERATOR_WRITES,
+    "POST /v1/alarms/{alarm}/acknowledge": OPERATOR,  # alarms are for those who watch, whoever moves the arm
+    "POST /v1/alarms/{alarm}/shelve": OPERATOR,
+    "POST /v1/alarms/{alarm}/unshelve": OPERATOR,
+    "POST /v1/alarms/{alarm}/out-of-service": MAINTAINER,
+    "POST /v1/alarms/{alarm}/in-service": MAINTAINER,
     "POST /v1/knowledge/outline": OPERATOR,
     "POST /v1/read-photograph": OPERATOR,
     "POST /v1/panel-pose": OPERATOR_TASK,

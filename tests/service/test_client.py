@@ -158,7 +158,7 @@ def test_another_server_at_the_address_is_told_apart_from_none(scripted: Client)
     assert "--url" in refusal.value.hint
 
 
-@pytest.mark.parametrize("url", ["", "ftp://localhost", "http://", "http://[::1", "https://localhost:1"])
+@pytest.mark.parametrize("url", ["", "ftp://localhost", "http://", "http://[::1", "ftp://localhost:1"])
 def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None:
     with pytest.raises(ConfigError, match="not the address of a service"):
         Client(url=url).get("/v1/info")

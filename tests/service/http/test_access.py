@@ -27,7 +27,17 @@ from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 
 ROLES = (None, *Role)
-PLACE = {"{name}": "arm", "{task_id}": "none", "{image_id}": "0" * 24, "{mission}": "none", "{group}": "kinds"}
+ALARM_DEEDS = ("acknowledge", "shelve", "unshelve", "out-of-service", "in-service")
+PLACE = {
+    "{alarm}": "none.high",
+    "{object}": "none",
+    "{crop}": "none",
+    "{name}": "arm",
+    "{task_id}": "none",
+    "{image_id}": "0" * 24,
+    "{mission}": "none",
+    "{group}": "kinds",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +111,7 @@ def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
         "DELETE /v1/session",
         "POST /v1/knowledge/outline",  # writes nothing
         "POST /v1/read-photograph",
+        *(f"POST /v1/alarms/{{alarm}}/{deed}" for deed in ALARM_DEEDS),  # for those who watch, whoever moves the arm
     }
 
 
@@ -183,21 +194,21 @@ def test_the_stop_needs_no_key_on_this_machine_and_its_reset_tells_whose_key(
 ) -> None:
     assert http.post("/v1/stop").json()["is_latched"]
     count = http.post("/v1/stop", headers=guarded.headers(Role.OBSERVER)).json()["count"]
-    assert guarded.rows("stop")[-1]["by"] == "the-observer"
+    assert guarded.rows("stop")[-1]["key_name"] == "the-observer"
     assert http.post("/v1/stop/reset", json={"seen_count": count}).status_code == 401
     done = http.post("/v1/stop/reset", json={"seen_count": count}, headers=guarded.headers(Role.OPERATOR))
     assert done.status_code == 200
-    assert guarded.rows("stop-reset")[-1]["by"] == "the-operator"
+    assert guarded.rows("stop-reset")[-1]["key_name"] == "the-operator"
 
 
 def test_the_journal_and_the_task_tell_whose_key_asked(http: httpx2.Client, guarded: Guarded) -> None:
     answer = http.post("/v1/judge?wait_s=10", json={"mission": "none"}, headers=guarded.headers(Role.OPERATOR))
     assert answer.status_code >= 400  # there is no such mission; the task was recorded before
-    assert guarded.rows("task-queued")[-1]["by"] == "the-operator"
+    assert guarded.rows("task-queued")[-1]["key_name"] == "the-operator"
     grant = http.post("/v1/lease", json={"holder": "x"}, headers=guarded.headers(Role.OPERATOR)).json()
     token = {"Lease-Token": grant["token"], **guarded.headers(Role.OPERATOR)}
     assert http.post("/v1/lease/release", headers=token).status_code == 200
-    assert guarded.rows("lease-acquired")[-1]["by"] == "the-operator"
+    assert guarded.rows("lease-acquired")[-1]["key_name"] == "the-operator"
     guarded.server.service.tasks._tasks.clear()
 
 

@@ -151,10 +151,8 @@ class Service:
         if operation is None:
             raise InvalidRequest(f"there is no verb {verb!r}", hint=f"verbs: {', '.join(self.operations)}")
         operation.check(self.cell, request)
-        moves, holder = operation.may_move(request), None
-        if moves or operation.writes:
-            is_repeat = key is not None and self.tasks.has_key(key)
-            holder = self.lease.check(command.token) if is_repeat else self.lease.admit(command)
+        moves = operation.may_move(request)
+        holder = self._admit(command, key) if moves or operation.writes else None
         self._check_cell()
         latch = self.supervisor.latch.state()
         if moves and latch.is_latched:
@@ -188,6 +186,11 @@ class Service:
         if moves:
             self._confirm(task, command.token)
         return task
+
+    def _admit(self, command: Command, key: str | None) -> str | None:
+        """Ask the lease, and return its holder; the number of a command that is repeated with its key counts once."""
+        is_repeat = key is not None and self.tasks.has_key(key)
+        return self.lease.check(command.token) if is_repeat else self.lease.admit(command)
 
     def _confirm(self, task: Task, lease_token: str | None) -> None:
         """Check the lease again, because a client that took it over before the task was listed could not cancel the task."""

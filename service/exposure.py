@@ -16,7 +16,6 @@ from service.access.keys import KeyBook
 
 LOCAL_NAMES = ("127.0.0.1", "localhost", "::1")
 LOOPBACK = ("127.0.0.1", "localhost")
-EVERY_ADDRESS = ("0.0.0.0", "::", "")  # noqa: S104 - compared, not bound
 SOCKET_MODE = 0o660  # of the Unix socket: the proxy's group is the service's
 REMEDY = "listen on 127.0.0.1 and reach it through ssh -L; or see docs/how-to/deploy.md for keys and TLS"
 
@@ -59,7 +58,7 @@ class Exposure:
 
     def url(self, port: int) -> str:
         """Return the address of the API for programs of this machine."""
-        host = LOOPBACK[0] if self.host in EVERY_ADDRESS else self.host
+        host = LOOPBACK[0] if _is_every_address(self.host) else self.host
         return f"{self.scheme}://{host}:{port}"
 
     def names_at(self, port: int) -> tuple[frozenset[str], frozenset[str]]:
@@ -93,7 +92,7 @@ class Exposure:
                 )
             if self.tls_cert is None and not self.behind_proxy:
                 faults.append("no TLS, so anybody could read the keys: --tls-cert and --tls-key, or --behind-proxy")
-            if self.host in EVERY_ADDRESS and not self.names:
+            if _is_every_address(self.host) and not self.names:
                 faults.append("no --name, so no Host header can be checked: the name or address that clients use")
         if faults:
             where = "refusing to start" if self.is_local else f"refusing to listen on {self._where()}"
@@ -158,6 +157,13 @@ def _answers(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         return probe.connect_ex(str(path)) == 0
+
+
+def _is_every_address(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_unspecified
+    except ValueError:
+        return not host
 
 
 def _bare(name: str) -> str:

@@ -79,6 +79,18 @@ class InvalidRequest(CellError):
     retry = Retry.AFTER_FIX
 
 
+class NoRoom(InvalidRequest):
+    """The hand does not fit at a control; names what is in the way and by how many millimetres; nothing moved."""
+
+
+class OutOfReach(InvalidRequest):
+    """A control is beyond the arm wherever the panel may stand; says by how many millimetres; nothing moved."""
+
+
+class Unprovable(InvalidRequest):
+    """No look and no touch could confirm the goal, so it is not begun; nothing moved."""
+
+
 class Unsupported(CellError):
     """This backend lacks the capability; another one, chosen in the cell file, may have it."""
 

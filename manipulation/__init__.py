@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from manipulation.skills.operate import operate
     from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
     from manipulation.skills.probe import proximity_probe, touch_probe
+    from manipulation.skills.rehearsal import out_of_reach_m, rehearse
     from manipulation.skills.retreat import free_hand, park, step_back
     from manipulation.skills.sweep import plan_sweep
     from manipulation.skills.travel import back_out_of, plan_to_first, plan_to_joints, reachable, stands_clear
@@ -42,6 +43,7 @@ __all__ = [
     "free_hand",
     "is_in_reach",
     "operate",
+    "out_of_reach_m",
     "park",
     "plan_sweep",
     "plan_to_first",
@@ -49,6 +51,7 @@ __all__ = [
     "plausibility",
     "proximity_probe",
     "reachable",
+    "rehearse",
     "stands_clear",
     "step_back",
     "touch_points",

@@ -150,7 +150,7 @@ class Service:
         operation = self.operations.get(verb)
         if operation is None:
             raise InvalidRequest(f"there is no verb {verb!r}", hint=f"verbs: {', '.join(self.operations)}")
-        operation.check(self.cell, request)
+        operation.refuse(self.cell, request, self.supervisor.connection, self.world)
         moves = operation.may_move(request)
         holder = self._admit(command, key) if moves or operation.writes else None
         self._check_cell()

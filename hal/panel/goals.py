@@ -89,11 +89,14 @@ class NumberGoal:
         Raises:
             InvalidRequest: no number is given, or it is not within the limits of the object called `name`.
         """
-        if not isinstance(asked, float | int) or not self.low <= asked <= self.high:
-            raise InvalidRequest(
-                f"{name} needs {self.key} from {self.low:g} to {self.high:g} {self.unit}".rstrip(),
-                hint=f"send {{'object': '{name}', '{self.key}': ...}}",
-            )
+        hint = f"send {{'object': '{name}', '{self.key}': ...}}"
+        wanted = f"{name} needs {self.key} from {self.low:g} to {self.high:g} {self.unit}".rstrip()
+        if not isinstance(asked, float | int):
+            raise InvalidRequest(wanted, hint=hint)
+        if not self.low <= asked <= self.high:
+            end = "above" if asked > self.high else "below"
+            by = f"{max(asked - self.high, self.low - asked):g} {self.unit}".rstrip()
+            raise InvalidRequest(f"{wanted}: {asked:g} is {by} {end} the end of its way", hint=hint)
         return float(asked)
 
     def text(self, target: str | float) -> str:

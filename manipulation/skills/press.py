@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 
+from hal.errors import Unprovable
 from hal.panel import Button, Mushroom
 from hal.panel.parts import LATCHED_SHARE
 from manipulation.skills import cap as feeling
@@ -14,6 +15,7 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, Skil
 from manipulation.skills.repeat import MAX_ATTEMPTS, perform
 
 PUSHES = 2  # of a latching cap in one attempt: where its state cannot be felt before, the first may show that
+LEAST_DEPTH_SIGMAS = 3.0  # of a felt height: the least depth of a latched cap that can be told from none
 ENOUGH_SHARE = 0.8  # of the travel: a shorter push may have had no effect
 
 
@@ -29,7 +31,18 @@ def press_latching(
     Args:
         target: `pressed` or `released`; None for the other state than it has.
         releases: whether a push releases a latched cap.
+
+    Raises:
+        Unprovable: a latched cap stands hardly deeper than a released one.
     """
+    depth_m = LATCHED_SHARE * cap.travel_m
+    if depth_m < LEAST_DEPTH_SIGMAS * feeling.FELT_SIGMA_M:
+        raise Unprovable(
+            f"{cap.name} stays only {1e3 * depth_m:.1f} mm deeper when it is pressed, which no touch can prove: at least "
+            f"{1e3 * LEAST_DEPTH_SIGMAS * feeling.FELT_SIGMA_M:.1f} mm can be felt",
+            hint="correct travel_m in the panel file, or let the button light a lamp that shows its state",
+            object=cap.name,
+        )
     tries = itertools.count()
 
     def stroke(attempt: Attempt) -> float:

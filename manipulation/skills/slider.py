@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from hal.errors import InvalidRequest
+from hal.errors import InvalidRequest, Unprovable
 from hal.motion import Guard, Quantity
 from hal.panel import Scale, Slider
 from manipulation.planning.cartesian_path import shifted
@@ -19,7 +19,7 @@ from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import force_at_rest_n, meet
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
+from manipulation.skills.outcome import SURE, ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
 from manipulation.skills.repeat import perform
 
 TIP_HEIGHT_M = 0.007  # height of the fingertip above the plate; with a pose error it does not touch the plate
@@ -34,6 +34,7 @@ PUSH_M_PER_S = 0.05
 SHORT_M = 0.003  # the push pauses at this distance from the end to measure the compression of the pads
 TOLERANCE_RATIO = 0.02
 LARGEST_STOP_N = 36.0
+SEEN_SIGMA_M = 0.00015  # of the best look: a third of a pixel from close up
 AGREE_M = 0.002  # largest difference of the two witnesses; three sigmas of two looks and of the contact with the cap
 
 
@@ -68,6 +69,7 @@ def slider(
 
     Raises:
         InvalidRequest: the value is off the scale, or the present value is not known.
+        Unprovable: the track is so short that no look is fine enough.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name = fader.name
@@ -76,6 +78,7 @@ def slider(
         raise InvalidRequest(
             f"{target} {scale.unit} is off the scale of {name}", hint=f"{scale.minimum} to {scale.maximum} {scale.unit}"
         )
+    _check_provable(fader)
     where = InitialState(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
     allowed = TOLERANCE_RATIO * (scale.maximum - scale.minimum)
 
@@ -101,6 +104,17 @@ def slider(
         is_reached=is_reached,
         verify=where.verify,
     )
+
+
+def _check_provable(fader: Slider) -> None:
+    allowed_m = TOLERANCE_RATIO * abs(fader.scale.at_max - fader.scale.at_min)
+    if allowed_m <= SURE * SEEN_SIGMA_M:
+        raise Unprovable(
+            f"{100 * TOLERANCE_RATIO:g} % of its way of {fader.name} are {1e3 * allowed_m:.2f} mm, and the best look at it is sure "
+            f"to {1e3 * SURE * SEEN_SIGMA_M:.2f} mm only",
+            hint="operate it by hand, or correct travel_m in the panel file",
+            object=fader.name,
+        )
 
 
 def agree(scale: Scale, seen: float | None, felt_m: float | None) -> bool:

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from hal.errors import InvalidRequest
+from hal.errors import InvalidRequest, Unprovable
 from hal.motion import Guard, Quantity
 from hal.panel import Toggle
 from manipulation.planning.cartesian_path import shifted
@@ -24,6 +24,7 @@ BEYOND_M = 0.013  # distance of the fingertip's face beyond the middle at the en
 SWEEP_M_PER_S = 0.03
 FIRST_N = 24.0  # of the first try; the fingertip ends it against the bat's stop, some newtons higher
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
+LEAST_SEEN_M = 0.002  # way of the tip between the states: five pixels of a close-up
 END_N = 4.0  # added to the force of the detent, so that the bat is at its stop
 
 
@@ -80,10 +81,19 @@ def toggle(
 
     Raises:
         InvalidRequest: a toggle has no such state.
+        Unprovable: its two states look the same.
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     if target not in ("on", "off"):
         raise InvalidRequest(f"a toggle has no state {target!r}", hint="on (up) or off (down)")
+    moves_m = 2.0 * switch.bat_length_m * np.sin(switch.tilt_rad)
+    if moves_m < LEAST_SEEN_M:
+        raise Unprovable(
+            f"the tip of {switch.name} moves by only {1e3 * moves_m:.1f} mm between on and off, which no look can tell: at "
+            f"least {1e3 * LEAST_SEEN_M:.1f} mm can be seen",
+            hint="correct bat_length_m and tilt_rad in the panel file",
+            object=switch.name,
+        )
     up = 1.0 if target == "on" else -1.0
     tries, throws = itertools.count(), itertools.count()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
@@ -13,7 +13,15 @@ from hal.devices import DeviceKind
 from service.operations.session import OperationContext, Session, check_looked_for
 from service.schema import fuse_request, fuse_results, mission_results, requests, results
 
+if TYPE_CHECKING:
+    from manipulation import Kinematics
+    from service.processes.connection import CellConnection
+    from service.world_model import WorldModel
+
 __all__ = ["OPERATIONS", "Operation", "OperationContext"]
+
+Arm = Callable[[], "Kinematics | None"]
+"""Gives the kinematics of the cell's arm; None while the cell is not running."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,6 +40,7 @@ class Operation:
         needs: kinds of devices that it may need in addition to those of every motion (`moves`).
         is_still: returns whether a given request moves nothing although the verb may move the arm.
         check: raises `InvalidRequest`, before a task is created, for a request that is not possible in this cell.
+        check_with_arm: the same where it takes the arm to know that.
     """
 
     name: str
@@ -45,6 +54,14 @@ class Operation:
     needs: tuple[DeviceKind, ...] = ()
     is_still: Callable[[Any], bool] = field(default=lambda _request: False)
     check: Callable[[Cell, Any], None] = field(default=lambda _cell, _request: None)
+    check_with_arm: Callable[[Cell, Any, Arm], None] = field(default=lambda _cell, _request, _arm: None)
+
+    def refuse(self, cell: Cell, request: BaseModel, connection: CellConnection, world: WorldModel) -> None:
+        """Raise `InvalidRequest` for a request that is not possible in this cell, before a task is created."""
+        from service.feasibility import arm_of  # imported when needed, so that the service starts fast
+
+        self.check(cell, request)
+        self.check_with_arm(cell, request, lambda: arm_of(connection, world))
 
     def may_move(self, request: BaseModel) -> bool:
         """Return whether the arm may move for this request."""
@@ -78,13 +95,13 @@ def _in_session(module: str, function: str) -> Callable[[OperationContext, Any],
     return run
 
 
-def _checked_by(function: str) -> Callable[[Cell, Any], None]:
-    """Return a check by `service.operations.manipulate.<function>(cell, request)`, imported at the first call."""
+def _checked_by(function: str) -> Callable[[Cell, Any, Arm], None]:
+    """Return a check by `service.feasibility.<function>(cell, request, arm)`, imported at the first call."""
 
-    def check(cell: Cell, request: Any) -> None:
-        from service.operations import manipulate
+    def check(cell: Cell, request: Any, arm: Arm) -> None:
+        from service import feasibility
 
-        getattr(manipulate, function)(cell, request)
+        getattr(feasibility, function)(cell, request, arm)
 
     return check
 
@@ -168,7 +185,7 @@ OPERATIONS: dict[str, Operation] = {
             needs=(DeviceKind.CAMERA,),
             summary="Operate one control and read back whether it reached its target",
             example={"object": "main_valve", "state": "open"},
-            check=_checked_by("check_manipulate"),
+            check_with_arm=_checked_by("check_manipulate"),
         ),
         Operation(
             name="missions",
@@ -178,7 +195,7 @@ OPERATIONS: dict[str, Operation] = {
             needs=SENSORS,
             summary="Run the whole mission and write its report",
             example={"touches": 4},
-            check=_checked_by("check_mission"),
+            check_with_arm=_checked_by("check_mission"),
         ),
         Operation(
             name="calibrations",

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from hal.config import Cell
 from hal.devices import DeviceKind
-from hal.entry_points import registered
 from hal.errors import (
     CellError,
     DeviceError,
-    InvalidRequest,
     MotionError,
     NotFound,
     PerceptionError,
@@ -18,9 +15,9 @@ from hal.errors import (
     Unreachable,
 )
 from hal.panel import PanelObject
-from hal.panel.kinds import SKILLS, has_part
 from manipulation import ObjectState, Outcome, SkillReport, Verify, free_hand, operate
 from perception.vision import ObjectReading, said
+from service.feasibility import target_of, text_of
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.locate import OFF_PLACE_M, look_again
 from service.operations.session import Session
@@ -28,7 +25,7 @@ from service.operations.travel import park, skill_context
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.schema.mission_results import ActionResult, ManipulateResult
-from service.schema.requests import ActionBody, ManipulateRequest, MissionRequest
+from service.schema.requests import ActionBody, ManipulateRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -170,42 +167,6 @@ def _after_doubt(
         motions=(*report.motions, *again.motions),
     )
     return both, [shift.finding]
-
-
-def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
-    """Return the target of an action; the usual target of the kind when the request names none.
-
-    Raises:
-        InvalidRequest: the object cannot be operated, or has no such state or value.
-    """
-    goal = panel_object.goal
-    if goal is None or not has_part(SKILLS, panel_object.kind):
-        raise InvalidRequest(
-            f"{panel_object.name} is a {panel_object.kind}, which cannot be operated: it is read only",
-            hint=f"kinds that can be: {', '.join(registered(SKILLS))}",
-        )
-    for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # refused, because its meaning would be a guess
-        if getattr(body, other) is not None:
-            hint = f"send {{'object': '{panel_object.name}', '{goal.key}': ...}}"
-            what = f"{panel_object.name} is a {panel_object.kind}: it takes {goal.key}, not {other}"
-            raise InvalidRequest(what, hint=hint)
-    return goal.checked(panel_object.name, getattr(body, goal.key))
-
-
-def text_of(panel_object: PanelObject, target: str | float) -> str:
-    """Return a target as text for reports."""
-    return str(target) if panel_object.goal is None else panel_object.goal.text(target)
-
-
-def check_manipulate(cell: Cell, request: ManipulateRequest) -> None:
-    """Raise `InvalidRequest` for an action that is not possible on the cell's panel."""
-    target_of(cell.panel.object(request.object), request)
-
-
-def check_mission(cell: Cell, request: MissionRequest) -> None:
-    """Raise `InvalidRequest` when one of the actions is not possible on the cell's panel."""
-    for body in request.actions or ():
-        target_of(cell.panel.object(body.object), body)
 
 
 def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateResult:

@@ -67,13 +67,14 @@ class Asked:
         """Order all deeds in one mission and judge them at its end; the peak of a deed is that on its control."""
         began_s = _truth(self.server).sim_time_s
         _clear_stop(self.client)
-        task = _ended(self.client, "/v1/missions", {"actions": [deed.body for deed in self.deeds]})
+        task, refused = self._mission()
         truth = _truth(self.server, began_s)
         reports = self.client.get("/v1/missions")["missions"]
         if not reports:
             return PanelRun(seed=self.seed, deeds=(), problem=_said(task)["cause"])
         document = self.client.get(f"/v1/missions/{reports[0]['name']}/report.json")
         answers = {action["object"]: {**action, "cause": action["detail"]} for action in document["actions"]}
+        answers |= refused
         early = {**NOTHING, "cell_s": 0.0, "outcome": "not-begun", "cause": _said(task)["cause"]}
         worked = frozenset(
             name for deed in self.deeds for name in (deed.object, self.panel.object(deed.object).shown_by)
@@ -90,6 +91,16 @@ class Asked:
             readings=(verdict.get("readings_right", 0), verdict.get("readings_given", 0)),
             cell_s=document["cell_s"],
         )
+
+    def _mission(self) -> tuple[dict[str, Any], dict[str, Answer]]:
+        """Run all deeds in one mission; deeds that are refused are left out, and returned as answers by object."""
+        task = _ended(self.client, "/v1/missions", {"actions": [deed.body for deed in self.deeds]})
+        details = (task["problem"] or {}).get("details") or {}
+        if not details.get("faults"):
+            return task, {}
+        refused = {name: {**_said(task), "cell_s": 0.0} for name in details["objects"]}
+        rest = [deed.body for deed in self.deeds if deed.object not in refused]
+        return _ended(self.client, "/v1/missions", {"actions": rest}), refused
 
 
 def asked_of(

@@ -8,15 +8,23 @@ from typing import Any
 
 import pytest
 
-from hal.config import load_cell
-from hal.errors import InvalidRequest
+from hal.config import Cell, load_cell
+from hal.errors import InvalidRequest, NoRoom, OutOfReach
+from manipulation import Kinematics
+from service.feasibility import target_of
 from service.operations import OPERATIONS
-from service.operations.manipulate import target_of
 from service.operations.mission import usual_actions
+from service.problem import status_of
 from service.schema.requests import ActionBody
 from service.world_model import WorldModel
+from tests.manipulation.arms import T3
 
 CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
+ARM = Kinematics.of(T3)
+
+
+def no_arm() -> None:
+    return None
 
 
 @pytest.mark.parametrize(
@@ -55,8 +63,41 @@ def test_nonsense_is_refused_by_both_verbs_that_work_controls(body: dict[str, An
     for verb, request in (("manipulate", body), ("missions", {"actions": (ActionBody(**body),)})):
         operation = OPERATIONS[verb]
         with pytest.raises(InvalidRequest, match=why) as refused:
-            operation.check(CELL, operation.request_model(**request))
+            operation.check_with_arm(CELL, operation.request_model(**request), no_arm)
         assert hint in refused.value.hint
+
+
+def crowded(**moved: tuple[float, float]) -> Cell:
+    """Return the bench cell with some objects elsewhere."""
+    objects = tuple(
+        one.model_copy(update={"position_m": moved[one.name]}) if one.name in moved else one
+        for one in CELL.panel.objects
+    )
+    return CELL.model_copy(update={"panel": CELL.panel.model_copy(update={"objects": objects})})
+
+
+def test_all_that_a_mission_cannot_do_is_refused_at_once() -> None:
+    x, y = CELL.panel.object("pump").position_m
+    cell = crowded(emergency=(x, y + 0.030))
+    asked = (
+        {"object": "pump", "state": "on"}, {"object": "setpoint", "value": 104.0}, {"object": "start", "state": "on"},
+        {"object": "pressure", "value": 1.0},
+    )  # fmt: skip
+    request = OPERATIONS["missions"].request_model(actions=tuple(ActionBody(**body) for body in asked))
+    with pytest.raises(NoRoom, match=r"pump stands too near to emergency: .* lacks .* mm") as refused:
+        OPERATIONS["missions"].check_with_arm(cell, request, lambda: ARM)
+    assert refused.value.details["objects"] == ["pump", "setpoint", "pressure"]
+    assert "104 is 4 % above the end of its way" in refused.value.details["faults"][1]
+    assert status_of(refused.value) == 422
+
+
+def test_a_control_that_no_pose_of_the_panel_brings_into_reach_is_refused() -> None:
+    workspace = CELL.file.workspace.model_copy(update={"panel_position_m": (3.0, 0.0, 0.55)})
+    cell = CELL.model_copy(update={"file": CELL.file.model_copy(update={"workspace": workspace})})
+    request = OPERATIONS["manipulate"].request_model(object="pump", state="on")
+    with pytest.raises(OutOfReach, match=r"pump is beyond the arm's reach by \d+ mm"):
+        OPERATIONS["manipulate"].check_with_arm(cell, request, lambda: ARM)
+    OPERATIONS["manipulate"].check_with_arm(CELL, request, lambda: ARM)
 
 
 def test_a_button_that_nothing_shows_can_be_asked_for_a_press_only() -> None:

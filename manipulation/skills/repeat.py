@@ -31,7 +31,8 @@ def perform(
 ) -> SkillReport:
     """Try a stroke, retreat, read back, and try at most twice more while the read-back does not show the target.
 
-    A stroke that felt the target state itself (`Attempt.felt`) needs no read-back.
+    A stroke that felt the target state itself (`Attempt.felt`) needs no read-back. A look at a control that the hand has
+    missed in every try proves nothing, because the look would be the only witness.
 
     Args:
         repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees. Not for a
@@ -40,23 +41,22 @@ def perform(
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on; the caller parks when that is possible.
     """
-    attempt = Attempt(context)
-    started_s = context.mover.state().stamp_s
+    attempt, started_s = Attempt(context), context.mover.state().stamp_s
     seen: ObjectState | None = None
     reached: float | None = None
-    outcome, cause, tries = Outcome.UNREACHABLE, "", 0
+    outcome, cause, tries, is_met = Outcome.UNREACHABLE, "", 0, False
     for tries in range(1, attempts + 1):
         context.progress((tries - 1) / attempts, f"{skill} {object_name}: attempt {tries}")
         outcome, cause, reached = _try(attempt, stroke)
-        looks = outcome is Outcome.UNVERIFIED and verify is not None and attempt.felt is None
-        context.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {'look again' if looks else cause}")
+        context.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {_next(attempt, outcome, cause, verify)}")
         if outcome is Outcome.UNREACHABLE:
             break
         if outcome is Outcome.UNVERIFIED and attempt.felt is not None and is_reached(attempt.felt):
             outcome, seen = Outcome.DONE, attempt.felt
             break
+        is_met = is_met or outcome is not Outcome.MISSED
         seen = None if verify is None else verify()
-        if seen is not None and is_reached(seen):
+        if seen is not None and is_reached(seen) and is_met:
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
         if outcome is Outcome.UNVERIFIED and seen is None:
@@ -77,6 +77,11 @@ def perform(
         peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0),
         motions=tuple(attempt.reports),
     )  # fmt: skip
+
+
+def _next(attempt: Attempt, outcome: Outcome, cause: str, verify: Verify | None) -> str:
+    looks = outcome is Outcome.UNVERIFIED and verify is not None and attempt.felt is None
+    return "look again" if looks else cause
 
 
 def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:

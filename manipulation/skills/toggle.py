@@ -24,6 +24,7 @@ BEYOND_M = 0.013  # distance of the fingertip's face beyond the middle at the en
 SWEEP_M_PER_S = 0.03
 FIRST_N = 24.0  # of the first try; the fingertip ends it against the bat's stop, some newtons higher
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
+MET_N, MET_SHARE = 2.0, 0.1  # across the fingers, in this share of the sweep: less is noise or the hand's inertia
 LEAST_SEEN_M = 0.002  # way of the tip between the states: five pixels of a close-up
 END_N = 4.0  # added to the force of the detent, so that the bat is at its stop
 
@@ -67,16 +68,18 @@ def toggle(
     switch: Toggle,
     target: str,
     *,
-    current: ObjectState | None = None,
+    current: ObjectState | None = None,  # noqa: ARG001 - not needed, because the bat is felt
     verify: Verify | None = None,
 ) -> SkillReport:
-    """Throw the toggle to `on` (up) or `off` (down); a toggle that has the target state already is only read.
+    """Throw the toggle to `on` (up) or `off` (down), also if it is seen there already, which then changes nothing.
+
+    Two witnesses must agree before it is done: the look afterwards, and the fingertip that met the bat at its stop beyond
+    the pivot. Two looks of 200 drills were wrong twice in the same way.
 
     The mechanical estimate in the report is how far past the pivot the fingertip's face came, m; more than 0 means that
     the toggle was thrown.
 
     Args:
-        current: what the last observation showed.
         verify: the caller's read-back.
 
     Raises:
@@ -95,12 +98,9 @@ def toggle(
             object=switch.name,
         )
     up = 1.0 if target == "on" else -1.0
-    tries, throws = itertools.count(), itertools.count()
+    throws = itertools.count()
 
-    def stroke(attempt: Attempt) -> float | None:
-        is_said_there = current is not None and current.state == target and next(tries) == 0
-        if is_said_there and verify is not None and (seen := verify()) is not None and seen.state == target:
-            return None
+    def stroke(attempt: Attempt) -> float:
         return throw(attempt, switch, up, most_n=FIRST_N if next(throws) == 0 else np.inf)
 
     return perform(
@@ -125,7 +125,7 @@ def throw(
         most_n: largest force of this try, where a further one may use all that the switch may need.
 
     Raises:
-        SkillFailure: the bat did not give way, or the fingertip did not come down beside it.
+        SkillFailure: the bat did not give way, none was met, or the fingertip did not come down beside it.
     """
     half = max(attempt.context.hand.closed_half_m)
     # The bat leans away from the target; come down beyond it.
@@ -134,12 +134,14 @@ def throw(
     start, end = y - up * (lean + half + SIDE_M), y + up * (BEYOND_M - half)
     _come_down(attempt, switch, start, end, PIVOT_M + grip_ratio * switch.bat_length_m)
     stop_n = min(stop_force_n(switch), most_n)
-    moved = _sweep(attempt, end - start, stop_n)
+    moved, is_met = _sweep(attempt, end - start, stop_n)
     past = float(moved - (abs(end - start) - BEYOND_M))
     if past < -0.004:
         outcome = Outcome.STALLED if stop_n == most_n else Outcome.STIFF
         raise SkillFailure(outcome, f"the bat did not give way at {stop_n:.0f} N", reached=past)
     attempt.leave()
+    if not is_met:
+        raise SkillFailure(Outcome.MISSED, "no bat was met on the way over the pivot", reached=past)
     return past
 
 
@@ -172,8 +174,11 @@ def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float, r
     attempt.advance(-0.002, name="lift off", speed_m_per_s=0.03)
 
 
-def _sweep(attempt: Attempt, way_m: float, stop_n: float) -> float:
-    """Push along the panel's y axis until the bat reaches its stop; returns how far the fingertip moved, m."""
+def _sweep(attempt: Attempt, way_m: float, stop_n: float) -> tuple[float, bool]:
+    """Push along the panel's y axis until the bat reaches its stop.
+
+    Returns how far the fingertip moved, m, and whether it met anything.
+    """
     here = attempt.pose()
     sweep = attempt.context.panel_pose.rotation.apply([0.0, way_m, 0.0])
     unit = sweep / np.linalg.norm(sweep)
@@ -183,4 +188,6 @@ def _sweep(attempt: Attempt, way_m: float, stop_n: float) -> float:
     guard = Guard(name="end stop", quantity=Quantity.FORCE, limit=stop_n, axis=against, ticks=1)
     goal = shifted(here, here.rotation.inv().apply(sweep))
     report = attempt.straight(goal, name="sweep", speed_m_per_s=SWEEP_M_PER_S, guards=(guard,), compliance=SOFT_PUSH)
-    return float((report.base_from_tool.translation - here.translation) @ unit)
+    across_n = np.linalg.norm(report.log.wrench[:, :2], axis=1)
+    is_met = len(across_n) > 0 and float(np.quantile(across_n, 1.0 - MET_SHARE)) >= MET_N
+    return float((report.base_from_tool.translation - here.translation) @ unit), is_met

@@ -16,6 +16,7 @@ from hal.motion import (
     CartesianPath,
     DeclaredMotion,
     JointTrajectory,
+    MotionLog,
     MotionOutcome,
     MotionReport,
     RobotState,
@@ -71,31 +72,40 @@ def before_the_bench(answers: dict[str, MotionReport]) -> tuple[SkillContext, Na
     return context, mover
 
 
+def swept(force_n: float) -> MotionReport:
+    """Return the report of a sweep over a toggle's pivot, in the last third of which a force acts."""
+    wrench = np.zeros((30, 6))
+    wrench[20:, 1] = force_n
+    log = MotionLog(times_s=np.arange(30.0), positions_rad=np.zeros((30, 6)), wrench=wrench, tip_m=np.zeros((30, 3)))
+    return replace(COMPLETED, log=log, base_from_tool=transform_rpy((9.0, 9.0, 9.0), (0.0, 0.0, 0.0)))
+
+
 @pytest.mark.parametrize(
-    ("before", "looks", "sweeps"),
+    ("felt_n", "looks", "outcome", "sweeps"),
     [
-        ("on", ["on", "on"], 0),  # already in the goal state: only read
-        ("on", ["off", "on"], 1),  # it was reported to be in the goal state, but is not
-        ("on", [None, "on"], 1),  # unknown: switching does no harm
-        ("on", ["on", "off", "on"], 1),  # the readings disagree
-        ("off", ["on"], 1),
-        (None, ["on"], 1),
+        (12.0, ["on"], "done", 1),  # also if it was seen there already: two looks may be wrong in the same way
+        (12.0, ["off", "on"], "done", 2),
+        (12.0, [None], "unverified", 1),
+        (0.5, ["on", "on", "on"], "missed", 3),  # no bat was met, so the look would be the only witness
+        (0.5, ["off", "off", "off"], "missed", 3),
     ],
 )
-def test_a_toggle_that_stands_there_already_is_looked_at_and_thrown_only_when_in_doubt(
-    before: str | None, looks: list[str | None], sweeps: int
+def test_a_toggle_is_done_only_if_the_bat_is_felt_and_seen(
+    felt_n: float, looks: list[str | None], outcome: str, sweeps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    context, mover = before_the_bench({})
+    context, mover = before_the_bench({"sweep": swept(felt_n)})
+    monkeypatch.setattr("manipulation.skills.repeat.retreat", lambda *_: None)
     shown = iter(looks)
 
     def look() -> ObjectState | None:
         state = next(shown)
         return None if state is None else ObjectState(name="pump", state=state)
 
-    current = None if before is None else ObjectState(name="pump", state=before)
-    told = toggle(context, context.panel.object("pump"), "on", current=current, verify=look)
+    told = toggle(
+        context, context.panel.object("pump"), "on", current=ObjectState(name="pump", state="on"), verify=look
+    )
     assert next(shown, "no more") == "no more"
-    assert (told.is_done, mover.asked.count("to pump")) == (True, sweeps)
+    assert (told.outcome, mover.asked.count("to pump")) == (outcome, sweeps)
 
 
 @pytest.mark.parametrize(
@@ -160,19 +170,27 @@ def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_
     assert mover.asked[-1] == "to park" and "in the way" in caught.value.hint
 
 
-def _turned(name: str, target: str, now: ObjectState, seen: ObjectState) -> Outcome:
-    """The hand finds nothing between its fingers, so only the reading decides."""
-    context, _ = before_the_bench({})
-    return operate(context, context.panel.object(name), target, current=now, verify=lambda: seen).outcome
-
-
-@pytest.mark.parametrize(("off_deg", "outcome"), [(5.0, Outcome.DONE), (40.0, Outcome.MISSED)])
-@pytest.mark.parametrize("name", ["mode", "main_valve"])
-def test_an_angle_that_was_seen_is_a_state_only_near_it(name: str, off_deg: float, outcome: Outcome) -> None:
+@pytest.mark.parametrize(("off_deg", "outcome"), [(5.0, Outcome.DONE), (40.0, Outcome.SLIPPED)])
+@pytest.mark.parametrize(("name", "stroke"), [("mode", "rotary.turn_bar"), ("main_valve", "lever._turn_lever")])
+def test_an_angle_that_was_seen_is_a_state_only_near_it(
+    name: str, stroke: str, off_deg: float, outcome: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first, last = PANEL.object(name).states[0], PANEL.object(name).states[-1]
+    monkeypatch.setattr(f"manipulation.skills.{stroke}", lambda *_, **__: 0.0)
     now = ObjectState(name=name, angle_rad=first.angle_rad)
     seen = ObjectState(name=name, angle_rad=last.angle_rad - np.radians(off_deg))
-    assert _turned(name, last.name, now, seen) is outcome
+    context, _ = before_the_bench({})
+    told = operate(context, context.panel.object(name), last.name, current=now, verify=lambda: seen)
+    assert told.outcome is outcome
+
+
+def test_a_look_at_what_the_hand_has_missed_proves_nothing() -> None:
+    """The hand finds nothing between its fingers, so the look would be the only witness."""
+    context, _ = before_the_bench({})
+    last = PANEL.object("mode").states[-1]
+    now, seen = (ObjectState(name="mode", angle_rad=angle) for angle in (-0.7854, last.angle_rad))
+    told = operate(context, context.panel.object("mode"), last.name, current=now, verify=lambda: seen)
+    assert (told.outcome, told.attempts) == (Outcome.MISSED, 3)
 
 
 @pytest.mark.parametrize("seen", [5, 10])

@@ -42,6 +42,7 @@ class Attempt:
 
     Attributes:
         felt: the state of the object that the fingers felt after the stroke; None if the stroke proves none.
+        is_against: whether the fingers felt that the target is not reached.
         cause: how the stroke ended, for people.
     """
 
@@ -50,6 +51,7 @@ class Attempt:
         self.reports: list[MotionReport] = []
         self.is_stopped_in_transfer = False
         self.felt: ObjectState | None = None
+        self.is_against = False
         self.cause = ENDED
 
     def run(self, motion: DeclaredMotion) -> MotionReport:

@@ -94,13 +94,17 @@ class SkillReport:
 
 
 class SkillFailure(Exception):
-    """Ends an attempt with an outcome; it is caught within the skills."""
+    """Ends an attempt with an outcome; it is caught within the skills.
 
-    def __init__(self, outcome: Outcome, cause: str, *, reached: float | None = None) -> None:
+    `is_sure`: the hand felt that the target is not reached, so that no look alone can say that it is.
+    """
+
+    def __init__(self, outcome: Outcome, cause: str, *, reached: float | None = None, is_sure: bool = False) -> None:
         super().__init__(cause)
         self.outcome = outcome
         self.cause = cause
         self.reached = reached
+        self.is_sure = is_sure
 
 
 def wrapped(angle_rad: float) -> float:

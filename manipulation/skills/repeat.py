@@ -31,8 +31,8 @@ def perform(
 ) -> SkillReport:
     """Try a stroke, retreat, read back, and try at most twice more while the read-back does not show the target.
 
-    A stroke that felt the target state itself (`Attempt.felt`) needs no read-back. A look at a control that the hand has
-    missed in every try proves nothing, because the look would be the only witness.
+    A stroke that felt the target state itself (`Attempt.felt`) needs no read-back. A look that shows the target is no proof
+    where the fingers felt the contrary, or where the hand has missed the control in every try.
 
     Args:
         repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees. Not for a
@@ -56,7 +56,7 @@ def perform(
             break
         is_met = is_met or outcome is not Outcome.MISSED
         seen = None if verify is None else verify()
-        if seen is not None and is_reached(seen) and is_met:
+        if seen is not None and is_reached(seen) and is_met and not attempt.is_against:
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
         if outcome is Outcome.UNVERIFIED and seen is None:
@@ -85,11 +85,12 @@ def _next(attempt: Attempt, outcome: Outcome, cause: str, verify: Verify | None)
 
 
 def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:
-    attempt.felt, attempt.cause = None, ENDED
+    attempt.felt, attempt.is_against, attempt.cause = None, False, ENDED
     try:
         reached = stroke(attempt)
         return Outcome.UNVERIFIED, attempt.cause, reached
     except SkillFailure as failure:
+        attempt.is_against = failure.is_sure
         retreat(attempt.context, attempt)
         return failure.outcome, failure.cause, failure.reached
     except Unreachable as failure:

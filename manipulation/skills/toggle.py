@@ -138,7 +138,8 @@ def throw(
     past = float(moved - (abs(end - start) - BEYOND_M))
     if past < -0.004:
         outcome = Outcome.STALLED if stop_n == most_n else Outcome.STIFF
-        raise SkillFailure(outcome, f"the bat did not give way at {stop_n:.0f} N", reached=past)
+        what = f"the bat did not give way at {stop_n:.0f} N"
+        raise SkillFailure(outcome, what, reached=past, is_sure=True)
     attempt.leave()
     if not is_met:
         raise SkillFailure(Outcome.MISSED, "no bat was met on the way over the pivot", reached=past)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 from hal.errors import MotionError, Unreachable
 from hal.geometry import certain, transform_rpy
@@ -72,12 +73,15 @@ def before_the_bench(answers: dict[str, MotionReport]) -> tuple[SkillContext, Na
     return context, mover
 
 
-def swept(force_n: float) -> MotionReport:
+FAR = transform_rpy((9.0, 9.0, 9.0), (0.0, 0.0, 0.0))
+
+
+def swept(force_n: float, to: RigidTransform = FAR) -> MotionReport:
     """Return the report of a sweep over a toggle's pivot, in the last third of which a force acts."""
     wrench = np.zeros((30, 6))
     wrench[20:, 1] = force_n
     log = MotionLog(times_s=np.arange(30.0), positions_rad=np.zeros((30, 6)), wrench=wrench, tip_m=np.zeros((30, 3)))
-    return replace(COMPLETED, log=log, base_from_tool=transform_rpy((9.0, 9.0, 9.0), (0.0, 0.0, 0.0)))
+    return replace(COMPLETED, log=log, base_from_tool=to)
 
 
 @pytest.mark.parametrize(
@@ -106,6 +110,14 @@ def test_a_toggle_is_done_only_if_the_bat_is_felt_and_seen(
     )
     assert next(shown, "no more") == "no more"
     assert (told.outcome, mover.asked.count("to pump")) == (outcome, sweeps)
+
+
+def test_a_look_does_not_outweigh_a_bat_that_was_felt_to_stay() -> None:
+    """In drill 118 a cable was read as the bat: 21 N ended the sweep before the pivot, and the look showed `on`."""
+    context, _ = before_the_bench({"sweep": swept(22.0, COMPLETED.base_from_tool)})
+    seen = ObjectState(name="pump", state="on")
+    told = toggle(context, context.panel.object("pump"), "on", verify=lambda: seen)
+    assert told.outcome is Outcome.STIFF and "did not give way" in told.cause
 
 
 @pytest.mark.parametrize(

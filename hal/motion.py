@@ -15,6 +15,9 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 
+STOPPING_S = 0.012
+"""Time in which a force still rises after a guard has seen it: two control ticks, and the arm's braking at its limit."""
+
 
 class Quantity(StrEnum):
     """The quantity that a guard watches."""
@@ -38,7 +41,11 @@ class Reaction(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guard:
-    """Trips when the quantity is at or beyond `limit` for `ticks` control ticks (below it when `below`)."""
+    """Trips when the quantity is at or beyond `limit` for `ticks` control ticks (below it when `below`).
+
+    With `ahead_s`, a force counts with what soft pads add to it in that time, which the arm takes to stop, at the speed that
+    the tip is commanded to.
+    """
 
     name: str
     quantity: Quantity
@@ -47,6 +54,7 @@ class Guard:
     below: bool = False
     ticks: int = 2
     reaction: Reaction = Reaction.STOP
+    ahead_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,8 @@ from manipulation.arm import kernels as arm_kernels
 
 RISE_WINDOW_S = 0.4
 RISE_AFTER_S = 0.15  # a motion that begins under load first builds up that load; a networked arm needs 50 ms more
+PADS_N_PER_M = 10_000.0  # of soft pads in contact; the rise that is measured flickers too much to foresee anything
+AHEAD_SHARE = 0.4  # of the limit, from which on there is contact that can rise
 RISE_SAMPLE_S = 0.016  # the running median is updated at 62 Hz; the force of a contact rises within a few updates
 
 
@@ -55,13 +57,24 @@ class _GuardMonitor:
         self._recent: deque[float] = deque(maxlen=round(RISE_WINDOW_S / RISE_SAMPLE_S))
         self._next_s = RISE_AFTER_S
         self._median: float | None = None
+        self._last: tuple[float, Array] | None = None
 
     def holds(self, now: Measured) -> bool:
         value = self._value(now)
+        if self.guard.ahead_s > 0.0:
+            value += self._ahead(now, value)
         beyond = value <= self.guard.limit if self.guard.below else value >= self.guard.limit
         # NaN compares false, so "nothing in range" never trips a guard.
         self._held = self._held + 1 if beyond else 0
         return self._held >= self.guard.ticks
+
+    def _ahead(self, now: Measured, value: float) -> float:
+        """Return what the force rises by in `ahead_s` at the speed of the last commanded step, while there is contact."""
+        last, self._last = self._last, (now.elapsed_s, now.commanded_tip_m)
+        if last is None or now.elapsed_s <= last[0] or value < AHEAD_SHARE * self.guard.limit:
+            return 0.0
+        step = now.commanded_tip_m - last[1]
+        return PADS_N_PER_M * math.sqrt(float(step @ step)) / (now.elapsed_s - last[0]) * self.guard.ahead_s
 
     def _value(self, now: Measured) -> float:
         match self.guard.quantity:

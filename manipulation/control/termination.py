@@ -8,13 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.arrays import Array
-from hal.motion import DeclaredMotion, GripperMotion, Guard, Hold, JointTrajectory, MotionOutcome, Quantity, Reaction
+from hal.motion import (
+    STOPPING_S,
+    DeclaredMotion,
+    GripperMotion,
+    Guard,
+    Hold,
+    JointTrajectory,
+    MotionOutcome,
+    Quantity,
+    Reaction,
+)
 from manipulation.control.guards import GuardSet, Measured
 from manipulation.control.sensing import Sample, ToolReading
 from manipulation.plausibility.arm import FOLLOWING_LIMIT_M
 
 TRACKING_TICKS = 5
-LOADED_START_RATIO = 1.2  # a motion that starts under load gets this higher limit, so that a jammed hand can be freed
+LOADED_MORE_N = 10.0  # a motion that starts beyond the limit may add so much, so that a jammed hand can be freed
 # A transfer touches nothing, and the hand's inertia shows at most 4 N in it. The force goes on rising while the arm stops.
 TRANSFER_FORCE_N = 30.0
 RAN = "ran to its declared end"
@@ -93,7 +103,9 @@ class TerminationMonitor:
         device = None
         match guard.name:
             case "force_limit":
-                cause = f"contact force {np.linalg.norm(look.wrench[:3]):.0f} N; at most {guard.limit:.0f} N is allowed"
+                force_n = float(np.linalg.norm(look.wrench[:3]))
+                rising = "" if force_n >= guard.limit else " and rising"
+                cause = f"contact force {force_n:.0f} N{rising}; at most {guard.limit:.0f} N is allowed"
             case "tracking":
                 behind_m = np.linalg.norm(look.base_from_tool[:3, 3] - look.commanded_tip_m)
                 cause = f"{self._arm} does not follow: {1e3 * behind_m:.0f} mm away from its last set-point"
@@ -112,12 +124,19 @@ def force_limit_n(motion: DeclaredMotion, cell_limit_n: float) -> float:
 def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
     """Return the guards of every motion: force and tracking.
 
-    A motion that begins under load gets a higher force limit, so that it may go on while the load does not grow.
+    A motion that begins beyond the limit may go on while the load does not grow. The force limit foresees what the force
+    rises by while the arm stops.
     """
-    loaded_n = LOADED_START_RATIO * float(np.linalg.norm(wrench[:3]))
-    force_n = max(force_limit_n, loaded_n)
+    loaded_n = float(np.linalg.norm(wrench[:3]))
+    force_n = force_limit_n if loaded_n < force_limit_n else loaded_n + LOADED_MORE_N
     return (
-        Guard(name="force_limit", quantity=Quantity.FORCE, limit=force_n, reaction=Reaction.FAULT),
+        Guard(
+            name="force_limit",
+            quantity=Quantity.FORCE,
+            limit=force_n,
+            reaction=Reaction.FAULT,
+            ahead_s=STOPPING_S,
+        ),
         Guard(
             name="tracking",
             quantity=Quantity.TRACKING,

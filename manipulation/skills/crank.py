@@ -16,8 +16,8 @@ from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
 from manipulation.skills.context import panel_from_grip
 
-RIM_MARGIN_M = 0.0038  # between a finger and the rim: the panel's pose and the rim's own shape are known less well
-HUB_MARGIN_M = 0.002
+RIM_MARGIN_M = 0.0022  # between a finger and the rim: the panel's pose and the rim's own shape are known less well
+HUB_MARGIN_M = 0.0013
 BEHIND_M = 0.006  # wanted distance between a finger and the spoke that it will push
 LEAST_BEHIND_M = 0.002
 
@@ -39,6 +39,11 @@ class SpokeHold:
     half_m: float
     arm_m: float
     behind_rad: float
+
+    @property
+    def side_per_nm(self) -> float:
+        """Force along the line of the fingers for each N m when both push equally, N/(N m)."""
+        return self.offset_m / float(np.hypot(self.offset_m, self.half_m)) / self.arm_m
 
     def opening_m(self, hand: Hand) -> float:
         """Opening between the fingers, m."""

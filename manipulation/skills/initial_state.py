@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from hal.errors import InvalidRequest
 from manipulation.skills.outcome import ObjectState, Verify
+
+LOOK_SHARE = 0.05  # of a period, by which an observation may lie outside of the places that are possible
 
 
 class InitialState:
@@ -16,7 +20,11 @@ class InitialState:
         what: name of the quantity, for people.
         current: what the last observation showed; without it `verify` is asked.
         verify: the caller's read-back.
-        period: observations show the place up to multiples of this; the one nearest to what is known is taken.
+        period: observations show the place up to multiples of this; the one between the places that the control can be
+            at is taken (see `moved_by`).
+
+    Attributes:
+        is_sure: whether every observation so far has shown one possible place, neither none nor several.
     """
 
     def __init__(
@@ -33,6 +41,8 @@ class InitialState:
         self._verify = verify
         self._period = period
         self._place: float | None = None
+        self._between = (0.0, 0.0)  # least and largest motion since the newest observation
+        self.is_sure = True
         if current is not None:
             self._place = place_of(current)
         elif verify is not None:
@@ -54,6 +64,15 @@ class InitialState:
         self._place = place
         return place
 
+    def moved_by(self, motion: float, *, least: float, largest: float) -> None:
+        """Keep the place after a motion that was felt, and between which motions the true one must lie.
+
+        A hand that turns round cannot have turned a control further than itself. With less than a period between the two
+        limits the next observation shows the place, however wrong the felt motion was.
+        """
+        self._between = (self._between[0] + least - motion, self._between[1] + largest - motion)
+        self._place = self.known + motion
+
     @property
     def verify(self) -> Verify | None:
         """The caller's read-back, which also updates the kept angle or value; None when there is no read-back."""
@@ -63,7 +82,14 @@ class InitialState:
         seen = self._verify() if self._verify is not None else None
         place = self._place_of(seen) if seen is not None else None
         if place is not None and self._place is not None and self._period is not None:
-            place += self._period * round((self._place - place) / self._period)
+            place = self._only_possible(place, self._place, self._period)
         if place is not None:
-            self._place = place
+            self._place, self._between = place, (0.0, 0.0)
         return seen
+
+    def _only_possible(self, seen: float, known: float, period: float) -> float:
+        low, high = known + self._between[0] - LOOK_SHARE * period, known + self._between[1] + LOOK_SHARE * period
+        first = int(np.ceil((low - seen) / period))
+        possible = [seen + period * k for k in range(first, int(np.floor((high - seen) / period)) + 1)]
+        self.is_sure = self.is_sure and len(possible) == 1
+        return possible[0] if len(possible) == 1 else seen + period * round((known - seen) / period)

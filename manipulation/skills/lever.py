@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest
-from hal.motion import Compliance, Guard, MotionReport, Quantity
+from hal.motion import STOPPING_S, Compliance, Guard, MotionReport, Quantity
 from hal.panel import Lever
 from manipulation.planning.cartesian_path import arc, shifted
 from manipulation.skills.attempt import STANDOFF_M, Attempt
@@ -35,8 +35,8 @@ SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
 EASY_N = 35.0  # a bar that gives way below this is turned at once; a heavier one is loaded slowly first
 LOAD_M_PER_S = 0.02  # at 80 mm/s the force overshoots by 30 N before the arm has stopped
-LARGEST_N = 90.0  # below the cell's protective limit, to distinguish a stiff valve from a collision
-LARGEST_WITH_FRICTION_N = 96.0
+LARGEST_N = 88.0  # below the cell's protective limit, to distinguish a stiff valve from a collision
+LARGEST_WITH_FRICTION_N = 94.0
 FELT_RATIO, FELT_N = 1.25, 12.0  # a bar that needs more than this multiple of the felt force plus this much has stalled
 FELT_SAMPLES = 12  # of the log, a tenth of a second
 MOVED_RAD = np.radians(6.0)
@@ -238,8 +238,8 @@ def _felt_n(way: _Arc, report: MotionReport) -> float:
 def _efforts(way: _Arc, limit_n: float) -> tuple[Guard, ...]:
     """Return the guards of a turn: the force against it, and the whole force, to which friction adds."""
     return (
-        Guard(name="effort", quantity=Quantity.FORCE, limit=limit_n, axis=way.against),
-        Guard(name="effort", quantity=Quantity.FORCE, limit=LARGEST_WITH_FRICTION_N, ticks=4),
+        Guard(name="effort", quantity=Quantity.FORCE, limit=limit_n, axis=way.against, ahead_s=STOPPING_S),
+        Guard(name="effort", quantity=Quantity.FORCE, limit=LARGEST_WITH_FRICTION_N, ticks=4, ahead_s=STOPPING_S),
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.errors import DeviceFault, MotionError, MotionRefused
-from hal.motion import CartesianPath, Compliance, GripperMotion, Guard, MotionReport, Quantity
+from hal.motion import STOPPING_S, CartesianPath, Compliance, GripperMotion, Guard, MotionReport, Quantity
 from manipulation.planning.cartesian_path import line, shifted
 from manipulation.planning.smooth_path import SmoothPath
 from manipulation.planning.time_parameterization import SpeedLimits, timed
@@ -21,7 +21,8 @@ from manipulation.skills.attempt import LET_GO_N, PADS_M_PER_S, RETREAT_M, RETRE
 from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import SkillFailure
 
-PULL_N = (40.0, 60.0, 90.0)  # of one pull after the other; the last one is just below the cell's protective limit
+PULL_N = (40.0, 60.0, 80.0)  # of one pull after the other; the last one is below the cell's protective limit
+PULL_M_PER_S = 0.04  # of a hand that is held; at 0.15 m/s the force overshoots by 25 N
 PULLS = len(PULL_N)
 OPEN_MORE_M = 0.02
 OPENING_N = 12.0  # a larger rise while the pads open means that a finger presses against something from within
@@ -31,6 +32,7 @@ UNFELT_M_PER_S = 0.05  # where no force is measured
 TURN_BACK_RAD = 0.3  # how far back along its own way the arm goes from what it met in a transfer
 THIN_RAD = 0.01
 HELD_N = 10.0  # a hand that rests with more force on it is not free; weight and drift leave at most half of it
+HELD_NM = 0.4
 INF = float("inf")
 # Soft across the fingers, so that a finger slides out of what hooks it and a wheel may turn with it.
 YIELDING = Compliance(
@@ -38,12 +40,14 @@ YIELDING = Compliance(
     damping=(500.0, 500.0, 500.0, 10.0, 10.0, 10.0),
     max_offset_m=0.012,
 )
-# Almost no stiffness: across the fingers the arm goes where the forces push it, slowly, until they are small.
+# Almost no stiffness: across the fingers and about them the arm goes where the forces push it, slowly, until they are small.
+# Two fingers that press spokes are held by their friction, although no force across them is left.
 GIVING_WAY = Compliance(
-    stiffness=(50.0, 50.0, INF, INF, INF, INF),
-    damping=(4000.0, 4000.0, 4000.0, 10.0, 10.0, 10.0),
-    mass=(100.0, 100.0, 100.0, 1.0, 1.0, 1.0),
+    stiffness=(50.0, 50.0, INF, INF, INF, 0.5),
+    damping=(4000.0, 4000.0, 4000.0, 10.0, 10.0, 3.0),
+    mass=(100.0, 100.0, 100.0, 1.0, 1.0, 0.1),
     max_offset_m=0.012,
+    max_offset_rad=0.5,
 )
 GIVE_WAY_S = 0.5
 HELD_HINT = "something holds the hand: look at it, free it by hand or by the arm's own control, then park"
@@ -52,8 +56,9 @@ HELD_HINT = "something holds the hand: look at it, free it by hand or by the arm
 def retreat(context: SkillContext, attempt: Attempt | None = None, *, distance_m: float = RETREAT_M) -> None:
     """Free the hand and move it back along the fingers, for example after an error.
 
-    The arm first gives way to the forces across the fingers. The first pull is light and with the pads further open; the
-    next ones are stronger and with the pads moved to where they press on nothing. After a transfer that met something,
+    Before each pull the arm gives way to the forces across the fingers. The first pull is light;
+    the next ones are stronger and slow, with the pads further open, and with the pads moved to where they press on nothing.
+    After a transfer that met something,
     the arm goes a little way back along it instead.
 
     Raises:
@@ -65,14 +70,19 @@ def retreat(context: SkillContext, attempt: Attempt | None = None, *, distance_m
         return
     attempt = attempt or Attempt(context)
     against_n, cause = 0.0, "no path leads back along the fingers"
-    with suppress(SkillFailure, MotionRefused):
-        _give_way(attempt)
     for number, pull_n in enumerate(PULL_N):
-        # A gripper that fails, or has an implausible reading, does not end the retreat.
+        # A gripper that fails, or has an implausible reading, does not end the retreat. Pads that move while the hand is
+        # wedged wedge it more: a hand that is pressed from a side gives way first, and pulls once with the pads as they are.
+        was_pressed = _is_pressed(context)
+        with suppress(SkillFailure, MotionRefused):
+            _give_way(attempt)
         with suppress(SkillFailure, MotionRefused, DeviceFault):
-            _open(attempt) if number == 0 else _loosen(attempt)
+            if number > 1:
+                _loosen(attempt)
+            elif number == 1 or not was_pressed:
+                _open(attempt)
         try:
-            pulled = _pull(attempt, distance_m, pull_n)
+            pulled = _pull(attempt, distance_m, pull_n, slowly=number > 0 or _is_pressed(context))
         except (SkillFailure, MotionRefused) as failure:
             cause = str(failure)
             continue
@@ -81,14 +91,14 @@ def retreat(context: SkillContext, attempt: Attempt | None = None, *, distance_m
         against_n = max(against_n, float(np.linalg.norm(pulled.wrench[:3])))
         cause = f"{against_n:.0f} N hold it"
         with suppress(SkillFailure, MotionRefused):
-            _pull(attempt, -RELAX_M, pull_n)
+            _pull(attempt, -RELAX_M, pull_n, slowly=True)
     raise MotionError(f"the hand did not come free in {PULLS} pulls: {cause}", hint=HELD_HINT, force_n=against_n)
 
 
 def is_free(context: SkillContext) -> bool:
     """Return whether the hand rests with no contact force and the model shows nothing near it."""
     state = context.mover.state()
-    if float(np.linalg.norm(state.wrench[:3])) > HELD_N:
+    if _is_pressed(context):
         return False
     model = context.collision(width_m=max(state.gripper_width_m, 0.0))
     return model.is_clear(state.position_rad, margin_m=0.002)
@@ -107,8 +117,7 @@ def free_hand(context: SkillContext) -> None:
 
 def _give_way(attempt: Attempt) -> None:
     """Stay, but yield to the forces across the fingers; does nothing if the hand is free."""
-    state = attempt.context.mover.state()
-    if state.faults or float(np.linalg.norm(state.wrench[:3])) < HELD_N:
+    if attempt.context.mover.state().faults or not _is_pressed(attempt.context):
         return
     here = attempt.pose()
     attempt.run(
@@ -117,6 +126,13 @@ def _give_way(attempt: Attempt) -> None:
             base_from_tool=(here, here), compliance=GIVING_WAY, is_retreat=True,
         )
     )  # fmt: skip
+
+
+def _is_pressed(context: SkillContext) -> bool:
+    """Return whether something presses on the hand: a force, or a torque about the fingers."""
+    wrench = context.mover.state().wrench
+    along = context.flange_from_grip.rotation.apply([0.0, 0.0, 1.0])
+    return float(np.linalg.norm(wrench[:3])) >= HELD_N or abs(float(wrench[3:] @ along)) >= HELD_NM
 
 
 def _open(attempt: Attempt) -> None:
@@ -144,18 +160,23 @@ def _pads(attempt: Attempt, width_m: float, stop_n: float) -> MotionReport:
     )  # fmt: skip
 
 
-def _pull(attempt: Attempt, distance_m: float, pull_n: float) -> MotionReport:
+def _pull(attempt: Attempt, distance_m: float, pull_n: float, *, slowly: bool) -> MotionReport:
     """Move back along the fingers (negative: forwards), and yield across them."""
     context = attempt.context
     start = attempt.pose()
     against = Guard(
-        name="held", quantity=Quantity.FORCE, limit=pull_n, axis=(0.0, 0.0, 1.0 if distance_m > 0.0 else -1.0)
+        name="held",
+        quantity=Quantity.FORCE,
+        limit=pull_n,
+        axis=(0.0, 0.0, 1.0 if distance_m > 0.0 else -1.0),
+        ahead_s=STOPPING_S,
     )
+    speed_m_per_s = PULL_M_PER_S if slowly else RETREAT_M_PER_S
     motion = line(
         start,
         shifted(start, (0.0, 0.0, -distance_m)),
         name="retreat" if distance_m > 0.0 else "relax",
-        speed_m_per_s=UNFELT_M_PER_S if context.mover.state().faults else RETREAT_M_PER_S,
+        speed_m_per_s=min(speed_m_per_s, UNFELT_M_PER_S) if context.mover.state().faults else speed_m_per_s,
         flange_from_tool=context.flange_from_grip,
         guards=(against,),
         compliance=YIELDING,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.motion import Compliance, Guard, MotionReport, Quantity
+from hal.motion import CartesianPath, Compliance, Guard, MotionReport, Quantity
 from hal.panel import Handwheel
 from manipulation.planning.cartesian_path import arc, through
 from manipulation.skills.attempt import Attempt
@@ -16,21 +16,30 @@ from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.turning import Felt, felt_in
 
 TURN_M_PER_S = 0.08
+HEAVY_N, HEAVY_M_PER_S = 50.0, 0.03  # a larger side force is expected: the force overshoots less
 LAG_RAD = 0.8  # largest turn by which the hand is ahead of the wheel, because the pads yield
-FIRST_RAD = 0.5  # first part of a turn; it shows at which torque the wheel gives way
-NEXT_RAD = 0.3
+FIRST_RAD = 0.3  # first part of a turn; it shows at which torque the wheel gives way
+NEXT_RAD = 0.15
 SHORTEST_RAD = np.radians(1.0)
 MOVED_RAD = 0.1  # a wheel that stops before is stiff, one that stops later has stalled
-LARGEST_SIDE_N = 85.0  # below the cell's protective limit
-LARGEST_HELD_N = 75.0  # the same with the rim between the fingers, where friction is released in jumps
+LARGEST_SIDE_N = 88.0  # below the cell's protective limit
+LARGEST_HELD_N = 60.0  # the same with the rim between the fingers, where friction is released in jumps
+SIDE_TICKS = 5  # the hand's own vibration is not a load
 STOP_RATIO, STOP_NM = 1.4, 0.35  # an end stop is a torque above this multiple of the felt one plus this much
 SLIP_RATIO, SLIP_TICKS = 0.4, 10
 LOG_SAMPLES = 300
+SLIGHT_PER_NM = 1.0  # of a force along the line of the fingers; below it the spokes are opposite
 SIDE_SAMPLES = 15  # of the log, an eighth of a second
 INF = float("inf")
 DAMPING = (4000.0, 4000.0, 4000.0, 10.0, 10.0, 10.0)
 MASS = (400.0, 400.0, 400.0, 1.0, 1.0, 1.0)  # with 100 kg friction flips from tick to tick
 MAX_OFFSET_M = 0.008
+LOADING_DAMPING, LOADING_MASS = (1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0), (150.0, 150.0, 400.0, 1.0, 1.0, 1.0)
+RELAX_S = 0.5
+RELAXING = Compliance(
+    stiffness=(50.0, 50.0, 400.0, INF, INF, 0.5), damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 2.0),
+    mass=(150.0, 150.0, 400.0, 1.0, 1.0, 0.1), max_offset_m=0.012, max_offset_rad=0.5,
+)  # fmt: skip
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -43,6 +52,8 @@ class WheelTurn:
         most_nm: largest torque that this hold takes.
         up_m: how far the hand moves back to leave.
         open_m: opening that releases the rim; None when nothing is held between the fingers.
+        speed_m_per_s: of the turn, where a turn of 1 rad counts as 0.1 m.
+        side_per_nm: force along the line of the fingers for each N m, with which spokes that are not opposite push.
         moved_rad: how far the wheel has turned, not negative.
     """
 
@@ -53,9 +64,11 @@ class WheelTurn:
     most_nm: float
     up_m: float
     open_m: float | None = None
+    speed_m_per_s: float = TURN_M_PER_S
+    side_per_nm: float = 0.0
     moved_rad: float = 0.0
     _felt: Felt = field(default_factory=Felt)
-    _side_n: tuple[float, float] = (0.0, 0.0)
+    _side_n: float = 0.0
     _grip_from_hub: RigidTransform = field(init=False)
 
     def __post_init__(self) -> None:
@@ -68,6 +81,11 @@ class WheelTurn:
         """Torque that moved the wheel, or the largest that did not."""
         return self._felt.running_nm if self._felt.is_moving else self._felt.peak_nm
 
+    @property
+    def hand_rad(self) -> float:
+        """How far the hand has turned since it came down; the wheel cannot have turned further."""
+        return max(0.0, self._felt.end_rad)
+
     def turn(self, span_rad: float) -> None:
         """Turn the wheel by `span_rad` (not negative).
 
@@ -79,9 +97,8 @@ class WheelTurn:
         limit_rad = self.behind_rad + LAG_RAD + span_rad
         while True:
             report = self._turn_on(goal_rad)
-            if not self._felt.is_moving:
-                x, y = np.median(report.log.wrench[-SIDE_SAMPLES:, :2], axis=0)
-                self._side_n = float(x), float(y)
+            x_n, torque_nm = np.median(report.log.wrench[-SIDE_SAMPLES:][:, [0, 5]], axis=0)
+            self._side_n = float(np.sign(x_n) * self.side_per_nm * max(0.0, -self.sign * torque_nm))
             felt = self._felt = felt_in(self._felt, *self._log(report, start))
             self.moved_rad = felt.moved_rad
             if report.tripped == "slip" or felt.has_slipped:
@@ -101,12 +118,18 @@ class WheelTurn:
         """Release the wheel and move back from it."""
         if self.open_m is not None:
             self.attempt.open_to(self.open_m, name="let go")
-        elif not self._felt.has_slipped:
-            back = self._felt.end_rad - self.moved_rad - 0.7 * self.behind_rad  # until the fingers press no more
-            start = self._tool()
-            poses = arc(start, centre_m=start.translation, axis=self._axis(), angle_rad=-self.sign * back)
-            self._run(poses, "turn back", ())
+        self._relax()
         self.attempt.leave(self.up_m)
+
+    def _relax(self) -> None:
+        """Stay and yield, also about the fingers, until nothing presses on the hand: what presses rubs when it leaves."""
+        here = self.attempt.pose()
+        self.attempt.run(
+            CartesianPath(
+                name="relax", flange_from_tool=self.attempt.context.flange_from_grip,
+                times_s=np.array([0.0, RELAX_S]), base_from_tool=(here, here), compliance=RELAXING,
+            )
+        )  # fmt: skip
 
     def _axis(self) -> Array:
         clockwise: Array = self.attempt.context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
@@ -121,12 +144,9 @@ class WheelTurn:
         angle = self.sign * (goal_rad - self._felt.end_rad)
         here = self._tool()
         poses = arc(here, centre_m=here.translation, axis=self._axis(), angle_rad=angle)
-        return self._run(poses, "turn", self._guards())
-
-    def _run(self, poses: tuple[RigidTransform, ...], name: str, guards: tuple[Guard, ...]) -> MotionReport:
         tool = self.attempt.context.flange_from_grip * self._grip_from_hub
         motion = through(
-            poses, name=name, speed_m_per_s=TURN_M_PER_S, flange_from_tool=tool, guards=guards,
+            poses, name="turn", speed_m_per_s=self.speed_m_per_s, flange_from_tool=tool, guards=self._guards(),
             compliance=self._yielding(),
         )  # fmt: skip
         return self.attempt.run(motion)
@@ -134,28 +154,31 @@ class WheelTurn:
     def _yielding(self) -> Compliance:
         """Return how the hand yields: along the fingers, with the rim between them also radially.
 
-        Behind spokes it yields sideways as soon as the wheel moves, and keeps the side force with which that began, so
-        that the wheel guides the hand about its true hub.
+        Behind spokes it yields across the line of the fingers until both push equally. Along that line it yields as soon as
+        the wheel moves, or at once behind opposite spokes, down to the force with which these spokes push: what is more is
+        friction on the spokes, along which fingers slide that do not turn about the true hub.
         """
         along = 400.0
+        stiffness = (200.0, 200.0, along)
         if self.open_m is not None:
-            stiffness, side = (50.0, INF, along), (0.0, 0.0)
-        elif self._felt.is_moving:
-            stiffness, side = (200.0, 200.0, along), self._side_n
-        else:
-            stiffness, side = (INF, INF, along), (0.0, 0.0)
+            stiffness = (50.0, INF, along)
+        elif self.side_per_nm > SLIGHT_PER_NM and not self._felt.is_moving:
+            stiffness = (INF, 200.0, along)
+        is_loading = self.open_m is None and not self._felt.is_moving
         return Compliance(
-            stiffness=(*stiffness, INF, INF, INF), damping=DAMPING, mass=MASS, max_offset_m=MAX_OFFSET_M,
-            target_wrench=(*side, 0.0, 0.0, 0.0, 0.0),
+            stiffness=(*stiffness, INF, INF, INF), max_offset_m=MAX_OFFSET_M,
+            damping=LOADING_DAMPING if is_loading else DAMPING, mass=LOADING_MASS if is_loading else MASS,
+            target_wrench=(self._side_n, 0.0, 0.0, 0.0, 0.0, 0.0),
         )  # fmt: skip
 
     def _guards(self) -> tuple[Guard, ...]:
         """Return what ends a turn: more torque than the felt one, the largest push, or a hold that gives way."""
         against = (0.0, 0.0, -self.sign)  # the tool's z points into the panel, so a clockwise turn is positive about it
         most_n = LARGEST_SIDE_N if self.open_m is None else LARGEST_HELD_N
-        side = Guard(name="side force", quantity=Quantity.FORCE, limit=most_n)
-        if not self._felt.is_moving or self.open_m is not None:
-            return Guard(name="effort", quantity=Quantity.TORQUE, limit=self.most_nm, axis=against), side
+        side = Guard(name="side force", quantity=Quantity.FORCE, limit=most_n, ticks=SIDE_TICKS)
+        effort = Guard(name="effort", quantity=Quantity.TORQUE, limit=self.most_nm, axis=against)
+        if self.open_m is not None or not self._felt.is_moving:
+            return effort, side
         limit = min(self.most_nm, STOP_RATIO * self._felt.running_nm + STOP_NM)
         slip_nm = SLIP_RATIO * self._felt.running_nm
         return (

@@ -131,13 +131,17 @@ def kinematics(session: Session) -> Kinematics:
 
 
 def lever_angles(session: Session) -> Mapping[str, float]:
-    """Return the angles of the levers and selectors whose state has been read."""
-    readings = session.world.readings
-    return {
-        name: angles[state]
-        for name, angles in ((one.name, one.resting_angles) for one in session.panel.objects)
-        if name in readings and (state := readings[name].state) is not None and state in angles
-    }
+    """Return the angles of the levers and selectors that have been read: the angle itself, or that of the state."""
+    found: dict[str, float] = {}
+    for one in session.panel.objects:
+        reading, resting = session.world.readings.get(one.name), one.resting_angles
+        if reading is None or not reading.answered or not resting:
+            continue
+        if one.value_is_angle and reading.value is not None:
+            found[one.name] = reading.value
+        elif reading.state is not None and reading.state in resting:
+            found[one.name] = resting[reading.state]
+    return found
 
 
 def _where_the_panel_may_be(session: Session) -> CollisionBox:

@@ -61,3 +61,30 @@ def test_a_look_that_shows_one_turn_only_does_not_change_the_whole_turns() -> No
     where.moved_to(-8.8)
     where.verify()
     assert where.known == -9.0
+
+
+def test_a_look_between_two_holds_counts_the_turns_of_a_wheel_that_did_not_follow() -> None:
+    """The fingers felt 4.2 rad and slid all the way: the next look shows the angle of the beginning again."""
+    looks = iter([at(0.5), at(-1.6)])
+    where = InitialState(value_of, what="it", current=at(0.5), verify=lambda: next(looks), period=6.28)
+    assert where.verify is not None
+    where.moved_by(4.2, least=-0.2, largest=4.6)
+    where.verify()
+    assert (where.known, where.is_sure) == (0.5, True)
+    where.moved_by(4.2, least=-0.2, largest=4.6)
+    where.verify()
+    assert (where.known, where.is_sure) == (pytest.approx(4.68), True)
+
+
+def test_turns_that_no_look_has_told_apart_are_not_sure() -> None:
+    """Two holds of 4.2 rad without a look between them: the wheel may have turned once or not at all."""
+    looks = iter([None, at(0.5), at(0.5)])
+    where = InitialState(value_of, what="it", current=at(0.5), verify=lambda: next(looks), period=6.28)
+    assert where.verify is not None
+    where.moved_by(4.2, least=-0.2, largest=4.6)
+    where.verify()
+    where.moved_by(4.2, least=-0.2, largest=4.6)
+    where.verify()
+    assert not where.is_sure
+    where.verify()
+    assert not where.is_sure

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 
 MOST_BYTES = 64 << 20  # of one picture
+MOST_DIGITS = 12  # of a length
 START, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG
 _opening = threading.Lock()  # OpenCV takes FFmpeg's options from the environment
 
@@ -89,7 +90,8 @@ class PartParser:
         pairs = (line.decode("latin-1").partition(":") for line in lines[1:])
         headers = {name.strip().lower(): value.strip() for name, _, value in pairs}
         length = headers.get("content-length", "")
-        end = int(length) if length.isdigit() else rest.find(b"\r\n" + self._boundary)
+        is_number = length.isascii() and length.isdigit() and len(length) < MOST_DIGITS  # "²" is a digit, too
+        end = int(length) if is_number else rest.find(b"\r\n" + self._boundary)
         if end < 0 or len(rest) < end:
             return None
         self._buffer = rest[end:].lstrip(b"\r\n")

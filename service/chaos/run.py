@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from hal.errors import CellError
+from hal.errors import CellError, DeviceUnavailable
 from service.chaos.acks import Acks
 from service.chaos.faults import Broken, ChaosFault, Scene
 from service.chaos.judge import Judge
@@ -164,8 +164,10 @@ class Chaos:
                     done.breaches.append(f"a cancelled task did not end within {END_S:.0f} s")
         try:
             self._plant.await_ready(BACK_S)
+            if not self._await(self._can_read, BACK_S):
+                raise DeviceUnavailable("the cell says that it runs, but its arm cannot be read", hint="see the log")
         except CellError as error:
-            done.breaches.append(f"not back: {error.what}")
+            done.breaches.append(f"not back after {BACK_S:.0f} s: {error.what}")
             self._start_again(done)
         done.back_s = time.monotonic() - begun_s
         self._acks.release()
@@ -198,6 +200,14 @@ class Chaos:
     def _state(self, task_id: str) -> str:
         task = self._plant.state_of(task_id)
         return "" if task is None else str(task["state"])
+
+    def _can_read(self) -> bool:
+        """Return whether the arm answers: a cell whose simulated world is dead says that it runs."""
+        try:
+            self._plant.client(2.0).get(f"/v1/devices/{self._watch.arm}/reading")
+        except CellError:
+            return False
+        return True
 
     def _is_latched(self) -> bool:
         for client in (self._plant.stop_client(1.0), self._plant.client(1.0)):

@@ -18,6 +18,7 @@ from manipulation.skills.wheel_hold import Belief, Hold, behind_two_spokes, hold
 from manipulation.skills.wheel_turn import WheelTurn
 
 DRAGGED_RAD = 0.2  # largest turn by which a hand that lets go drags the wheel back
+GAINED_RAD = 0.3  # a wheel that stopped after a turn of so much is turned on
 LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand
 TOLERANCE_RAD = np.radians(6.0)
 AT_STOP_RAD = 0.35
@@ -113,8 +114,9 @@ def believed_angle(wheel: Handwheel, seen: ObjectState) -> float | None:
 def _turn_on(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Belief, target_rad: float) -> None:
     """Turn the wheel in one hold, and look how far it has come unless that was the last one.
 
-    A wheel too heavy for one hold is tried in the other. What a look shows between two holds is one turn at most, so it
-    counts the whole turns whatever the fingers felt.
+    A wheel too heavy for one hold is tried in the other, and one that stops on the way in another hold: friction between
+    fingers and spokes grows while the hand does not turn about the true hub. What a look shows between two holds is one
+    turn at most, so it counts the whole turns whatever the fingers felt.
 
     Raises:
         SkillFailure: as `_turn_once`; or the wheel has not followed the hand.
@@ -123,8 +125,13 @@ def _turn_on(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Be
     try:
         _turn_once(attempt, wheel, where, belief, target_rad - begun_rad)
     except SkillFailure as failure:
-        if failure.outcome is not Outcome.STIFF or not belief.has_another(wheel, attempt.context.hand):
+        if failure.outcome is Outcome.STIFF and belief.has_another(wheel, attempt.context.hand):
+            return
+        if failure.outcome is not Outcome.STALLED or where.verify is None or where.verify() is None:
             raise
+        if abs(target_rad - begun_rad) - abs(target_rad - where.known) < GAINED_RAD:
+            raise
+        belief.failed.clear()
         return
     if where.verify is None or abs(target_rad - where.known) <= 0.3 * TOLERANCE_RAD:
         return

@@ -16,7 +16,7 @@ from manipulation.planning.hand import Hand
 from manipulation.skills.attempt import APPROACH_M_PER_S, CONTACT_N, Attempt
 from manipulation.skills.outcome import Outcome, SkillFailure
 
-TRIES = 3
+TRIES = 4
 LIFT_M = 0.006
 ASIDE_M = 0.0025  # of one try; about what the places of a finger and of what it fits between are known to
 REST_S = 0.12
@@ -55,7 +55,7 @@ def come_down(attempt: Attempt, distance_m: float, *, what: str) -> None:
         attempt.straight(lifted, name="lift", speed_m_per_s=APPROACH_M_PER_S)
         if aside is None:
             break
-        offset = ASIDE_M * aside
+        offset = ASIDE_M * 0.5**number * aside  # a finger that lands on the other side has gone too far
         attempt.straight(shifted(attempt.pose(), offset), name="aside", speed_m_per_s=APPROACH_M_PER_S)
         goal = _below(attempt.pose(), goal)
     raise SkillFailure(Outcome.MISSED, f"a finger landed on {what}")

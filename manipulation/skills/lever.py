@@ -224,10 +224,16 @@ def _turn_most(attempt: Attempt, way: _Arc, start: RigidTransform, fast_rad: flo
         raise _gave_no_way(attempt, way, start, loaded)
     felt_n = _felt_n(way, loaded)
     limit_n = min(LARGEST_N, FELT_RATIO * felt_n + FELT_N)
-    rest = _turn_to(attempt, way, start, fast_rad, limit_n=limit_n, speed_m_per_s=STROKE_M_PER_S)
+    rest = _turn_to(attempt, way, start, fast_rad, limit_n=limit_n, speed_m_per_s=speed_for(felt_n))
     if rest.tripped is not None:
         raise _gave_no_way(attempt, way, start, rest)
     return felt_n
+
+
+def speed_for(felt_n: float) -> float:
+    """Return the speed at which a bar that takes `felt_n` is turned: the nearer to the largest force, the slower."""
+    share = (LARGEST_N - felt_n) / (LARGEST_N - EASY_N)
+    return float(np.clip(share * STROKE_M_PER_S, LOAD_M_PER_S, STROKE_M_PER_S))
 
 
 def _felt_n(way: _Arc, report: MotionReport) -> float:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.motion import MotionReport
+from hal.motion import STOPPING_S, MotionReport
 from manipulation.skills.attempt import Attempt
-from manipulation.skills.lever import LAST_M_PER_S, STOP_TRIES, _Arc, _to_the_stop
+from manipulation.skills.lever import LARGEST_N, LAST_M_PER_S, STOP_TRIES, STROKE_M_PER_S, _Arc, _to_the_stop, speed_for
 
 SPAN_RAD = np.pi / 2
 AXIS = np.array([0.0, 0.0, -1.0])
@@ -63,3 +63,11 @@ def test_a_rise_long_before_the_state_is_passed_on_the_way_to_the_same_goal() ->
 def test_a_bar_that_is_stuck_is_not_pushed_for_ever() -> None:
     attempt, _ = carried([(82.0, "end stop")] * 10)
     assert len(attempt.goals_rad) == STOP_TRIES
+
+
+@pytest.mark.parametrize("felt_n", [20.0, 50.0, 65.0, 80.0, LARGEST_N])
+def test_the_heavier_a_bar_the_slower_it_is_turned(felt_n: float) -> None:
+    """At 80 mm/s a bar of 81 N was pressed with 113 N before the arm had stopped."""
+    pads_n_per_m, friction_n = 10_000.0, 5.0
+    assert felt_n + pads_n_per_m * STOPPING_S * speed_for(felt_n) + friction_n < 100.0
+    assert (speed_for(felt_n) == STROKE_M_PER_S) == (felt_n == 20.0)

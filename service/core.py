@@ -213,17 +213,19 @@ class Service:
             DeviceUnavailable: the cell is not running.
             DeviceError, ConfigError: the new device did not connect; the old one is kept.
             MotionRefused, Busy: a motion or another swap is running.
+            JournalError: it cannot be recorded.
         """
         self._check_cell()
         check_wires(self.cell, {name: section})
         started_s = time.monotonic()
         told = {"device": name, "before": self.cell.file.devices[name].driver, "driver": section.driver}
+        self.commit("device-swap", told)
         try:
             self.supervisor.swap(name, section)
         except CellError as error:
             self.note("device-swap-failed", {**told, "why": error.what})
             raise
-        self.note("device-swapped", {**told, "seconds": round(time.monotonic() - started_s, 3)})
+        self.commit("device-swapped", {**told, "seconds": round(time.monotonic() - started_s, 3)})
 
     def lacking(self) -> dict[str, tuple[str, ...]]:
         """Return for each verb the missing devices that it may need; empty for a verb that can do all of its work."""

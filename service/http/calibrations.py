@@ -60,7 +60,7 @@ async def show_calibration(state: State, name: DeviceName) -> CalibrationView:
 )
 async def forget_calibration(state: State, _holder: Admitted, name: DeviceName) -> None:
     await state.in_thread(functools.partial(state.service.calibrations.forget, name))
-    state.service.note("calibration-forgotten", {"device": name})
+    await state.commit("calibration-forgotten", {"device": name})
 
 
 def _all(state: AppState, *, with_text: bool) -> list[CalibrationView]:

@@ -165,7 +165,7 @@ def _inject(service: Service, name: str, request: FaultRequest) -> DeviceView:
             f"{name} is not a simulated device, so faults cannot be injected", hint="use a simulated cell", device=name
         )
     device.inject_fault(request.fault, magnitude=request.magnitude)
-    service.note("fault-injected", {"device": name, "fault": request.fault, "magnitude": request.magnitude})
+    service.commit("fault-injected", {"device": name, "fault": request.fault, "magnitude": request.magnitude})
     return _view(service, name)
 
 

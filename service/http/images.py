@@ -73,6 +73,7 @@ async def store_image(state: State, _holder: Admitted, request: Request, respons
         )
     data = await request.body()
     image = ImageView.of(await state.in_thread(functools.partial(store_of(state).add, data)))
+    await state.commit("image-stored", {"image": image.id, "size_bytes": image.size_bytes})
     response.headers["Location"] = image.url
     return image
 
@@ -92,3 +93,4 @@ async def fetch_image(state: State, image_id: ImageName) -> FileResponse:
 @router.delete("/{image_id}", status_code=204, summary="Delete a stored image", operation_id="delete_image")
 async def delete_image(state: State, _holder: Admitted, image_id: ImageName) -> None:
     await state.in_thread(functools.partial(store_of(state).remove, image_id))
+    await state.commit("image-deleted", {"image": image_id})

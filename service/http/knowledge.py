@@ -131,7 +131,7 @@ async def teach_something(
     state: State, _holder: Admitted, request: Annotated[TeachRequest, DependsOn(strict_body(TeachRequest))]
 ) -> TaughtView:
     taught = await state.in_thread(functools.partial(teach, store_of(state), _store(state), request))
-    state.service.note("taught", {"what": taught.what, "name": taught.name, "added": taught.added})
+    await state.commit("taught", {"what": taught.what, "name": taught.name, "added": taught.added})
     return taught
 
 
@@ -152,6 +152,7 @@ async def show_panel_knowledge(state: State, name: PlainName) -> PanelView:
 )
 async def forget(state: State, _holder: Admitted, group: Literal["kinds", "panels"], name: PlainName) -> None:
     await state.in_thread(functools.partial(_store(state).forget, group, name))
+    await state.commit("knowledge-forgotten", {"group": group, "name": name})
 
 
 def _named(known: Sequence[V], name: str) -> V:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import functools
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Header, Request, WebSocket
 
@@ -69,6 +70,14 @@ class AppState:
     async def act(self, work: Callable[[], T]) -> T:
         """Run work that starts, stops, cancels or resets outside the event loop; no device read delays it."""
         return await asyncio.get_running_loop().run_in_executor(self.control_pool, _in_this_context(work))
+
+    async def commit(self, kind: str, data: dict[str, Any]) -> None:
+        """Record a change durably before it is acknowledged.
+
+        Raises:
+            JournalError: it could not be written; the change itself is in effect.
+        """
+        await self.act(functools.partial(self.service.commit, kind, data))
 
 
 def _in_this_context(work: Callable[[], T]) -> Callable[[], T]:

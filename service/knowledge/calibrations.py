@@ -11,6 +11,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
+from hal.atomic_write import flush_folder, write_atomically
 from hal.calibration import CalibrationRecord, load_calibration
 from hal.config import Cell
 from hal.errors import ConfigError
@@ -122,13 +123,12 @@ class Calibrations:
         path = self.folder / f"{section.mount.calibration}.toml"
         with self._lock:
             (self.folder / OLDER).mkdir(parents=True, exist_ok=True)
-            fresh = path.with_suffix(".new")
             before = path.read_text(encoding="utf-8") if path.exists() else None
-            fresh.write_text(to_toml(record, over=before), encoding="utf-8")
             if before is not None:
                 version = load_calibration(path).version
                 os.link(path, _unused(self.folder / OLDER / f"{path.stem}.v{version}.toml"))
-            fresh.replace(path)
+                flush_folder(self.folder / OLDER)
+            write_atomically(path, to_toml(record, over=before))
         return path
 
     def forget(self, device: str) -> None:
@@ -146,6 +146,8 @@ class Calibrations:
         with self._lock:
             older = self.folder / OLDER / f"{entry.path.stem}.v{entry.record.version}.toml"
             entry.path.rename(_unused(older))
+            flush_folder(self.folder / OLDER)
+            flush_folder(self.folder)
 
     def _measured(self) -> dict[str, Path]:
         """Return the files of this folder that replace a record of the cell, by the record's name."""

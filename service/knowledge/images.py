@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hal.atomic_write import flush_folder
 from hal.errors import InvalidRequest
 from service.errors import NoSuchTask, NotPossibleNow
 
@@ -78,8 +80,12 @@ class ImageStore:
                     )
                 partial = self._folder / f"{image_id}.part"
                 try:
-                    partial.write_bytes(data)
+                    with partial.open("wb") as file:
+                        file.write(data)
+                        file.flush()
+                        os.fsync(file.fileno())
                     partial.rename(self._folder / f"{image_id}{suffix}")
+                    flush_folder(self._folder)
                 finally:
                     partial.unlink(missing_ok=True)  # incomplete file after a full disk
         return self.get(image_id)

@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hal.atomic_write import write_atomically
+from hal.atomic_write import flush_folder, write_atomically
 from hal.errors import InvalidRequest
 from hal.panel import Panel, load_panel
 from service.errors import NoSuchTask
@@ -157,6 +157,7 @@ class KnowledgeStore:
                 hint="a shipped kind cannot be deleted; teach it again to replace it",
             )
         file.path.unlink(missing_ok=True)
+        flush_folder(file.path.parent)
 
 
 def check_name(name: str) -> None:

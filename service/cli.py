@@ -44,6 +44,7 @@ def _app() -> Callable[[], None]:
     import typer
 
     from service.commands import alarms, calibrate, devices, init, keys, serve, tasks
+    from service.commands.backup import backup, restore
     from service.commands.chaos import chaos
     from service.commands.check import check
     from service.commands.demo import demo
@@ -71,14 +72,9 @@ def _app() -> Callable[[], None]:
     app.callback()(root)
     app.add_typer(init.app)  # without a name of its own, so it is one command
     app.add_typer(serve.app)  # as `init`
-    app.command()(demo)
-    app.command()(record)
-    app.command()(replay)
-    app.command()(sweep)
-    app.command()(chaos)
-    app.command()(foxglove)
-    app.command()(doctor)
-    app.command()(check)
+    plain: tuple[Callable[..., None], ...] = (demo, record, replay, sweep, chaos, foxglove, doctor, check)
+    for command in plain:
+        app.command()(command)
     app.add_typer(devices.app, name="devices")
     app.command()(drivers)
     app.add_typer(tasks.app, name="task")
@@ -87,11 +83,9 @@ def _app() -> Callable[[], None]:
     app.command()(history)
     app.add_typer(alarms.app, name="alarms")
     app.add_typer(keys.app, name="keys")
-    app.command()(conform)
-    app.command()(warm)
-    app.command()(teach)
-    app.command()(learn)
-    app.command()(read)
+    plain = (backup, restore, conform, warm, teach, learn, read)
+    for command in plain:
+        app.command()(command)
     app.add_typer(calibrate.app, name="calibrate")
     app.command("range")(range_image)
     app.add_typer(batch, name="batch")

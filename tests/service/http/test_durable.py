@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.errors import JournalError
-from service.http.knowledge import KnowledgeStore
+from service.knowledge.store import KnowledgeStore
 from service.serve import Panelwright
 from tests.service.conftest import PANEL
 

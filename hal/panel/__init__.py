@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hal.panel.button import Button
     from hal.panel.display import Display
     from hal.panel.families import Rectangular, Round
-    from hal.panel.form import Envelope, Face, Relief, Rim, circle
+    from hal.panel.form import Cap, Envelope, Face, Relief, Rim, circle
     from hal.panel.gauge import Gauge
     from hal.panel.goals import GAUGE_SHARE, Goal, NumberGoal, Shown, StateGoal
     from hal.panel.handwheel import Handwheel
@@ -51,6 +51,7 @@ __all__ = [
     "GAUGE_SHARE",
     "LATCHED_SHARE",
     "Button",
+    "Cap",
     "Display",
     "Envelope",
     "Face",

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field, ValidationError, model_validator
 
 from hal.panel.angles import fault
-from hal.panel.form import Envelope, Face, Relief, Rim
+from hal.panel.form import Cap, Envelope, Face, Relief, Rim
 from hal.panel.goals import GAUGE_SHARE, Goal, Shown
 from hal.panel.limits import Limits, Priority
 from hal.panel.parts import Name, Positive, Vector2, Vector3
@@ -106,6 +106,11 @@ class PanelObject(Strict, ABC):
     @property
     def relief(self) -> Relief | None:
         """Appearance in a range image; None if it is not searched for in range images."""
+        return None
+
+    @property
+    def cap(self) -> Cap | None:
+        """Cap whose height tells its state; None if it has none."""
         return None
 
     @property

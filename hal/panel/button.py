@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal
 
 from hal.panel.families import Round
+from hal.panel.form import Cap
 from hal.panel.goals import StateGoal
 from hal.panel.parts import LATCHED_SHARE, Name, NotNegative, Positive
 from hal.panel.questions import COLOURS, Question, Taught
@@ -40,6 +41,11 @@ class Button(Round):
     def pressed_depth_m(self) -> float:
         """Depth below the released cap at which it is read as pressed, that is, held down or latched."""
         return LATCHED_SHARE * self.travel_m if self.latching else self.travel_m
+
+    @property
+    def cap(self) -> Cap:
+        """Its cap."""
+        return Cap(radius_m=self.radius_m, height_m=self.height_m, pressed_depth_m=self.pressed_depth_m)
 
     @property
     def goal(self) -> StateGoal:

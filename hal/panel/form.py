@@ -65,6 +65,31 @@ class Envelope:
     middle_m: Vector2 = (0.0, 0.0)
 
 
+CAP_SHARE = 0.25
+"""One standard deviation of a cap's height and of its travel, relative to the travel: neither is known better."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cap:
+    """Round, flat cap that moves along the plate's normal: its height tells whether it is pressed or released.
+
+    Attributes:
+        radius_m: of the cap.
+        height_m: of the released cap above the plate.
+        pressed_depth_m: how much lower it is when it is read as pressed.
+    """
+
+    radius_m: float
+    height_m: float
+    pressed_depth_m: float
+
+    def released_log_odds(self, height_m: float, sigma_m: float) -> float:
+        """Return the log odds of `released` over `pressed` from a measured height above the plate, m."""
+        depth_m = self.pressed_depth_m
+        variance_m2 = sigma_m**2 + (CAP_SHARE * depth_m) ** 2
+        return (height_m - (self.height_m - depth_m / 2)) * depth_m / variance_m2
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Relief:
     """Surfaces of the object in a range image, and how they move.

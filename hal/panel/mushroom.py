@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal
 
 from hal.panel.families import Round
-from hal.panel.form import Relief
+from hal.panel.form import Cap, Relief
 from hal.panel.goals import StateGoal
 from hal.panel.parts import LATCHED_SHARE, NotNegative, Positive
 
@@ -31,6 +31,11 @@ class Mushroom(Round):
     def pressed_depth_m(self) -> float:
         """Depth of a latched head below a released one."""
         return LATCHED_SHARE * self.travel_m
+
+    @property
+    def cap(self) -> Cap:
+        """Its cap."""
+        return Cap(radius_m=self.radius_m, height_m=self.height_m, pressed_depth_m=self.pressed_depth_m)
 
     @property
     def goal(self) -> StateGoal:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from perception.range.analysis import RangeScene, analyse
     from perception.range.batch import batch_range, recordings_in
     from perception.range.batch_results import BatchResult, KeptResults
+    from perception.range.cap_height import measure_cap
     from perception.range.matching.cross_check import check_place, outline_px, states_agree
     from perception.range.matching.match import Match, match_models
     from perception.range.matching.models import load_models, shipped_models
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from perception.range.plane import PlaneFit, fit_plane_near
     from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface, SurfaceType
     from perception.range.recordings import Reading, assumptions, load_recording
-    from perception.range.render import MARK, match_json, picture, scene_json, write_ply, write_png
+    from perception.range.render import MARK, picture, scene_json, write_ply, write_png
     from perception.range.sensor import OrthographicSensor, PinholeSensor
     from perception.range.sweep import ScannerTrack, SweepPass, image_from_sweep
     from perception.range.warm import warm_up
@@ -52,8 +53,8 @@ __all__ = [
     "image_from_sweep",
     "load_models",
     "load_recording",
-    "match_json",
     "match_models",
+    "measure_cap",
     "outline_px",
     "picture",
     "recordings_in",

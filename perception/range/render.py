@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,19 @@ PICTURE_PX = 768  # smaller images are enlarged to about this size, so that text
 LEAST_WRITTEN_PX = 500  # smaller surfaces in a picture get no text
 
 
-def scene_json(scene: RangeScene) -> dict[str, Any]:
-    """Return the scene as plain JSON values, in SI units (named in the keys) and in the sensor frame."""
+def scene_json(scene: RangeScene, matches: Sequence[Match] | None = None) -> dict[str, Any]:
+    """Return the scene as plain JSON values, in SI units (named in the keys) and in the sensor frame.
+
+    Args:
+        matches: the component models that were looked for; the key `components` is left out where there are None.
+    """
+    components = {} if matches is None else {"components": [_match_json(match) for match in matches]}
     return {
         "frame": "range_sensor",
         "noise_m_at_1_m": float(scene.noise.sigma_m(1.0)),
         "warnings": list(scene.warnings),
         "surfaces": [surface_json(s) for s in scene.surfaces],
+        **components,
     }
 
 
@@ -49,7 +56,7 @@ def surface_json(surface: Surface) -> dict[str, Any]:
     }
 
 
-def match_json(match: Match) -> dict[str, Any]:
+def _match_json(match: Match) -> dict[str, Any]:
     """Return a match as JSON values: pose with covariance (6x6 as `UncertainPose`), surfaces, state, free turns."""
     pose = match.sensor_from_object
     return {

@@ -54,7 +54,6 @@ def range_image(
         assumptions,
         load_models,
         load_recording,
-        match_json,
         match_models,
         scene_json,
         shipped_models,
@@ -73,8 +72,7 @@ def range_image(
     _print_matches(matches)
     for sentence in (*scene.warnings, *assumed):
         console.print(f"[yellow]note[/]   {escape(sentence)}")
-    document = {"recording": file.name, "assumed": list(assumed), **scene_json(scene)}
-    document["components"] = [match_json(match) for match in matches]
+    document = {"recording": file.name, "assumed": list(assumed), **scene_json(scene, matches)}
     written = [_in_folder(out) / f"{file.stem}{MARK}{suffix}" for suffix in (".json", ".png", ".ply")]
     written[0].write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     write_png(written[1], scene)

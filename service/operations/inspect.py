@@ -18,6 +18,7 @@ from perception.vision import ObjectReading, answer_at, draw_annotated, merge_vi
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate_from_overview, offset_m
+from service.operations.range_detection import read_by_height
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
@@ -138,14 +139,16 @@ def look_close(
 def look_past(session: Session, found: Inspection) -> Inspection:
     """Look from the sides at objects that are present but could not be read, until they can be read.
 
-    Objects of which two states look alike are looked at from a shorter distance.
+    Of objects of which two states look alike, a range image shows the height; those that it does not decide are looked at
+    from a shorter distance.
     """
     unread = [reading for reading in found.readings.values() if reading.present and not reading.answered]
     if len(unread) > MOST_UNREAD:
         return found
     looks = {reading.name: [reading] for reading in unread}
-    alike = [reading.name for reading in unread if reading.needs_closer_sides]
-    hidden = [name for name in looks if name not in alike]
+    by_height = read_by_height(session, [reading for reading in unread if reading.needs_closer_sides])
+    alike = [reading.name for reading in unread if reading.needs_closer_sides and reading.name not in by_height]
+    hidden = [reading.name for reading in unread if not reading.needs_closer_sides]
     pictures = list(found.pictures)
     ways = (
         (hidden, tuple(viewpoints.SIDES), viewpoints.CLOSE_UP_M),
@@ -156,7 +159,7 @@ def look_past(session: Session, found: Inspection) -> Inspection:
             [session.panel.object(name) for name in names], session.lens(), distance_m
         ):
             pictures += _from_the_sides(session, group, looks, sides)
-    told = {name: _told(each) for name, each in looks.items()}
+    told = {name: _told(each) for name, each in looks.items()} | by_height
     for name in told:
         session.world.forget_reading(name)  # a single image may have given a reading that the others contradict
     readings = found.readings | told

@@ -2,20 +2,21 @@
 
 This covers the kinds with a relief, such as mushroom buttons and handwheels. An object that is not found, or is found
 in another place, is scanned again from a shorter distance. The panel file is not corrected: an object that is still
-found in another place is reported and not operated.
+found in another place is reported and not operated. Caps whose states look alike are read by their heights.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from hal.devices import DeviceKind
-from hal.errors import NotFound, PerceptionError, Unreachable
+from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose
-from hal.panel import Panel, PanelObject
+from hal.panel import Cap, Panel, PanelObject
 from perception.range import (
     PanelScan,
     RangeScene,
@@ -24,11 +25,12 @@ from perception.range import (
     analyse,
     check_place,
     find_objects,
+    measure_cap,
     outline_px,
     states_agree,
 )
 from perception.vision import ObjectReading, viewpoints
-from service.operations.acquisition import Scan, settle
+from service.operations.acquisition import Scan, scan, settle
 from service.operations.locate import ScannedPlane, scan_plate
 from service.operations.session import Session
 from service.operations.travel import go_to_first
@@ -38,6 +40,7 @@ from service.report.surfaces import Mark, surfaces_picture
 from service.schema.mission_results import SurfaceCheck
 
 OVERVIEW, CLOSER = "the overview", "a closer look"
+SURE_ODDS = 6.0  # least logarithm of the odds of a state that a height proves
 
 
 def surfaces_in(image: Scan) -> RangeScene:
@@ -202,19 +205,84 @@ def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
 
 def _look_closer(session: Session, panel_object: PanelObject) -> SurfaceView | str:
     """Scan the object from a pose perpendicular to it; returns the reason as text when that is not possible."""
-    flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
-    views = viewpoints.close_up_poses(session.known_panel().parent_from_child, panel_object.point_m)
     try:
-        go_to_first(
-            session, (v * flange_from_scanner.inv() for v in views), name=f"closer look at {panel_object.name}"[:60]
-        )
-        settle(session)
+        _face(session, panel_object.point_m, name=f"closer look at {panel_object.name}")
         return view_surfaces(session, scan_plate(session), CLOSER)
     except (PerceptionError, Unreachable) as error:
         return error.what
+
+
+def _face(session: Session, point_m: tuple[float, float, float], *, name: str) -> None:
+    """Drive the scanner to a close-up of a panel point.
+
+    Raises:
+        Unreachable: the arm reaches no such pose.
+    """
+    flange_from_scanner = session.mount(session.first(DeviceKind.RANGE_SCANNER)).parent_from_child
+    views = viewpoints.close_up_poses(session.known_panel().parent_from_child, point_m)
+    go_to_first(session, (view * flange_from_scanner.inv() for view in views), name=name[:60])
+    settle(session)
 
 
 def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
     marks = [mark_of(s, view.scan, session.believed_panel()) for s in view.sightings]
     title = f"surfaces in the range image from {view.place}, and the objects of the panel file in it"
     return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))
+
+
+def read_by_height(session: Session, readings: Sequence[ObjectReading]) -> Mapping[str, ObjectReading]:
+    """Return new readings of those caps whose height in a range image proves their state.
+
+    A line scanner is not swept for it, because looks from the sides take less time. The same holds for a scanner that
+    fails: the failure is told as progress, and the caps are looked at from the sides.
+    """
+    unread = {reading.name: reading for reading in readings if session.panel.object(reading.name).cap is not None}
+    if not unread or not _has_range_camera(session):
+        return {}
+    proved: dict[str, ObjectReading] = {}
+    try:
+        for image, objects in _scans(session, [session.panel.object(name) for name in unread]):
+            for panel_object in objects:
+                odds = _released_log_odds(session, image, panel_object)
+                if odds is not None and abs(odds) >= SURE_ODDS:
+                    proved[panel_object.name] = _reading(unread[panel_object.name], odds)
+    except (DeviceError, PerceptionError, Unreachable) as error:
+        session.progress(1.0, "look past what hides it", f"no range image of {', '.join(unread)}: {error.what}")
+    return proved
+
+
+def _has_range_camera(session: Session) -> bool:
+    names = session.cell.names_of(DeviceKind.RANGE_SCANNER)
+    return bool(names) and not session.connection.device(names[0]).capabilities().needs_sweep
+
+
+def _scans(session: Session, caps: Sequence[PanelObject]) -> Iterator[tuple[Scan, tuple[PanelObject, ...]]]:
+    """Yield range images from close-ups that together show all caps, and the caps in each."""
+    for (x, y, z), names in viewpoints.close_up_groups(caps, session.lens()):
+        title = f"heights of {', '.join(names)}"
+        session.progress(1.0, "look past what hides it", title)
+        _face(session, (x, y, z), name=title)
+        yield scan(session), tuple(session.panel.object(name) for name in names)
+
+
+def _released_log_odds(session: Session, image: Scan, panel_object: PanelObject) -> float | None:
+    """Return the log odds of `released`; None if the image does not show the cap."""
+    cap: Cap | None = panel_object.cap
+    if cap is None:
+        return None
+    panel_from_foot = RigidTransform.from_translation(np.array(panel_object.point_m))
+    base_from_foot = session.known_panel().parent_from_child * panel_from_foot
+    measured = measure_cap(
+        image.depth_m,
+        image.pinhole(),
+        cap,
+        foot_from_sensor=base_from_foot.inv() * image.base_from_scanner.parent_from_child,
+        sensor_sigma_m=image.capabilities.sigma_m,
+    )
+    return None if measured is None else cap.released_log_odds(measured.height_m, measured.sigma_m)
+
+
+def _reading(unread: ObjectReading, odds: float) -> ObjectReading:
+    confidence = float(1.0 / (1.0 + np.exp(-abs(odds))))
+    state = "released" if odds > 0 else "pressed"
+    return replace(unread, state=state, confidence=confidence, reason=None, guess=None)

@@ -18,7 +18,6 @@ SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap whose position is wron
 # Of 230 flush caps none has more than 0.002 below, except for some synthetic ones beside glare (0.004 to 0.014).
 BELOW_FROM, BELOW_SCALE, BELOW_ODDS = 0.0075, 0.0015, 4.5
 ALONE = 1.3  # largest log odds of a shade without a visible face, or of missing shine without a visible ring
-MODEL_SHARE = 0.25  # standard deviation of cap height and travel, relative to the travel
 UNSEEN = "the button cannot be seen (glare, shadow or cover): change the angle or the light"
 
 
@@ -55,9 +54,7 @@ def _by_height(patch: Patch, spec: Button | Mushroom, foot_m: float | None) -> f
     cap = cap_height(patch, radius_m=spec.radius_m, low_m=lowest, high_m=high, foot_m=foot_m)
     if cap is None:
         return None
-    depth = spec.pressed_depth_m
-    sigma_m = np.hypot(cap.sigma_m, MODEL_SHARE * depth)  # cap height and travel are not known better than this share
-    return float((cap.height_m - (high - depth / 2)) * depth / sigma_m**2)
+    return spec.cap.released_log_odds(cap.height_m, cap.sigma_m)
 
 
 def _by_shade(patch: Patch, radius_m: float) -> float | None:

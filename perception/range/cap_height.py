@@ -37,7 +37,7 @@ def measure_cap(
         foot_from_sensor: pose of the sensor in the axes of the panel, with the origin at the cap's centre on the plate.
         sensor_sigma_m: standard deviation of one pixel, as the sensor states it.
     """
-    points = sensor.points(np.asarray(depth_m, float)).reshape(-1, 3)
+    points = sensor.points(depth_m).reshape(-1, 3)
     x, y, z = foot_from_sensor.apply(points[np.isfinite(points).all(axis=1)]).T
     r = np.hypot(x, y)
     on_cap = z[r < INSIDE * cap.radius_m]

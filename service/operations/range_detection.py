@@ -7,7 +7,7 @@ found in another place is reported and not operated. Caps whose states look alik
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -230,7 +230,7 @@ def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
     return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))
 
 
-def read_by_height(session: Session, readings: Sequence[ObjectReading]) -> Mapping[str, ObjectReading]:
+def read_by_height(session: Session, readings: Sequence[ObjectReading]) -> dict[str, ObjectReading]:
     """Return new readings of those caps whose height in a range image proves their state.
 
     A line scanner is not swept for it, because looks from the sides take less time. The same holds for a scanner that
@@ -273,7 +273,7 @@ def _released_log_odds(session: Session, image: Scan, panel_object: PanelObject)
     panel_from_foot = RigidTransform.from_translation(np.array(panel_object.point_m))
     base_from_foot = session.known_panel().parent_from_child * panel_from_foot
     measured = measure_cap(
-        image.depth_m,
+        np.asarray(image.depth_m, float),
         image.pinhole(),
         cap,
         foot_from_sensor=base_from_foot.inv() * image.base_from_scanner.parent_from_child,

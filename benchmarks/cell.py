@@ -88,7 +88,7 @@ def measure_mission(seed: int) -> list[Line]:
             client = Client(url=panelwright.url, timeout_s=120.0)
             clear_stop(client)
             with _Memory() as memory:
-                mission = run_to_end(client, "/v1/missions", {})
+                mission = run_to_end(client, "/v1/missions", {"file": "demo"})
             lag_s = float(client.get("/v1/info")["event_loop_lag_p99_s"])
             stops_s = _stops_while_rendering(client, panelwright.stop_url)
         finally:

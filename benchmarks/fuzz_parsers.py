@@ -34,7 +34,7 @@ from service.http.body import parse
 from service.http.problems import BadBody
 from service.processes.latch import Latch
 from service.processes.stop import StopServer
-from service.schema.requests import MissionRequest
+from service.schema.mission_request import MissionRequest
 
 ROOT = Path(__file__).parents[1]
 Feed = Callable[[Sequence[bytes]], object]

@@ -110,7 +110,7 @@ def run(seed: int, cell: Path, panel: Path | None = None, scanner: str | None = 
         try:
             client = Client(url=panelwright.url, timeout_s=120.0)
             clear_stop(client)
-            run_to_end(client, "/v1/missions", {})
+            run_to_end(client, "/v1/missions", {"file": "demo"})
             name = client.get("/v1/missions")["missions"][0]["name"]
             run_to_end(client, "/v1/judge", {"mission": name})
         finally:

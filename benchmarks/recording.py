@@ -22,7 +22,7 @@ from service.operations import OPERATIONS
 from service.recording.reader import numbers_of, open_recording
 from service.replay.book import Book, replayed_cell
 from service.replay.verdict import Verdict, differing, replay_tasks
-from service.schema.requests import MissionRequest
+from service.schema.mission_request import MissionRequest
 from service.serve import Options, Panelwright
 from service.warm import warm
 
@@ -92,7 +92,7 @@ def fly(seed: int, cell: Path, runs: Path, record: Path | None) -> Mission:
         cell_process = psutil.Process(next(one.pid for one in processes if one.name == "cell"))
         recorders = [p for p in psutil.Process().children() if any("spawn_main" in word for word in p.cmdline())]
         cpu_s = _cpu_s(cell_process), sum(map(_cpu_s, recorders))
-        task = panelwright.service.submit("missions", MissionRequest())
+        task = panelwright.service.submit("missions", MissionRequest(file="demo"))
         while not task.wait(1.0):
             pass
         spent_s = _cpu_s(cell_process) - cpu_s[0], sum(map(_cpu_s, recorders)) - cpu_s[1]

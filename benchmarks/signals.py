@@ -53,7 +53,7 @@ def ready(plant: Plant) -> None:
 def mission_begun(plant: Plant) -> None:
     """Begin a mission, and follow its events as another client does."""
     plant.await_ready(START_S)
-    task = plant.client().post("/v1/missions", {})
+    task = plant.client().post("/v1/missions", {"file": "demo"})
 
     def follow() -> None:
         with contextlib.suppress(CellError):
@@ -65,7 +65,7 @@ def mission_begun(plant: Plant) -> None:
 def in_motion(plant: Plant) -> None:
     """Begin a mission and wait until the arm moves."""
     plant.await_ready(START_S)
-    task = plant.client().post("/v1/missions", {})
+    task = plant.client().post("/v1/missions", {"file": "demo"})
     end_s = time.monotonic() + START_S
     while plant.client().get(f"/v1/tasks/{task['id']}")["fraction"] <= 0.06 and time.monotonic() < end_s:
         time.sleep(0.05)

@@ -43,7 +43,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import alarms, calibrate, devices, init, keys, serve, tasks
+    from service.commands import alarms, calibrate, devices, init, keys, missions, serve, tasks
     from service.commands.backup import backup, restore
     from service.commands.chaos import chaos
     from service.commands.check import check
@@ -78,6 +78,7 @@ def _app() -> Callable[[], None]:
     app.add_typer(devices.app, name="devices")
     app.command()(drivers)
     app.add_typer(tasks.app, name="task")
+    app.add_typer(missions.app, name="mission")
     app.command()(tasks.stop)
     app.command()(journal)
     app.command()(history)

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from pydantic import BaseModel
 from hal.caller import calling_as
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
+from service.access.actor import actor
 from service.access.keys import FILE as KEYS_FILE
 from service.access.keys import KeyBook
 from service.alarms.desk import AlarmDesk
@@ -157,6 +159,7 @@ class Service:
         latch = self.supervisor.latch.state()
         if moves and latch.is_latched:
             raise stopped(latch.source)
+        observe = partial(self.observations.of_task, verb=verb, asked_by=actor() or holder or "")
         sub = self.lease.lend(is_own=is_followed and holder is None) if moves else None
 
         def work(task: TaskContext) -> Any:
@@ -173,8 +176,7 @@ class Service:
                 cell=self.calibrations.applied(),
                 stop=self.supervisor.stop,
             )
-            clock = connection.clock
-            observer = self.observations.of_task(task=task.id, verb=verb, asked_by=holder or "", cell_now_s=clock.now_s)
+            observer = observe(task=task.id, cell_now_s=connection.clock.now_s)
             context = OperationContext(
                 connection=connection, task=task, runs_dir=self.runs_dir, world=self.world, observer=observer
             )

@@ -73,6 +73,12 @@ class JournalError(CellError):
     retry = Retry.AFTER_FIX
 
 
+class StepFailed(CellError):
+    """A step of a mission did not succeed, or was not begun because a condition was unmet or unknown."""
+
+    retry = Retry.AFTER_FIX
+
+
 class HistoryError(CellError):
     """The history of readings cannot be written, so no reading may be reported; or it cannot be read."""
 

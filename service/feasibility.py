@@ -8,16 +8,21 @@ import numpy as np
 
 from hal.config import Cell
 from hal.devices import DeviceKind
-from hal.entry_points import registered
 from hal.errors import CellError, InvalidRequest, OutOfReach, Unsupported
 from hal.frames import frame_tree
 from hal.geometry import identity
 from hal.panel import NumberGoal, PanelObject
-from hal.panel.kinds import SKILLS, has_part
 from manipulation import Hand, Kinematics, out_of_reach_m, rehearse
+from service.missions.check import target_of
+from service.missions.files import mission_of
+from service.missions.progress import Progress
 from service.processes.connection import CellConnection
-from service.schema.requests import ActionBody, ManipulateRequest, MissionRequest
+from service.schema.mission_file import SetStep
+from service.schema.mission_request import MissionRequest
+from service.schema.requests import ActionBody, ManipulateRequest
 from service.world_model import WorldModel, expected_panel
+
+__all__ = ["arm_of", "check_actions", "check_manipulate", "check_mission", "target_of", "text_of"]
 
 Arm = Callable[[], Kinematics | None]
 
@@ -31,26 +36,6 @@ def arm_of(connection: CellConnection, world: WorldModel) -> Kinematics | None:
         return None
 
 
-def target_of(panel_object: PanelObject, body: ActionBody) -> str | float:
-    """Return the target of an action; the usual target of the kind when the request names none.
-
-    Raises:
-        InvalidRequest: the object cannot be operated, or has no such state or value.
-    """
-    goal = panel_object.goal
-    if goal is None or not has_part(SKILLS, panel_object.kind):
-        raise InvalidRequest(
-            f"{panel_object.name} is a {panel_object.kind}, which cannot be operated: it is read only",
-            hint=f"kinds that can be: {', '.join(registered(SKILLS))}",
-        )
-    for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # refused, because its meaning would be a guess
-        if getattr(body, other) is not None:
-            hint = f"send {{'object': '{panel_object.name}', '{goal.key}': ...}}"
-            what = f"{panel_object.name} is a {panel_object.kind}: it takes {goal.key}, not {other}"
-            raise InvalidRequest(what, hint=hint)
-    return goal.checked(panel_object.name, getattr(body, goal.key))
-
-
 def text_of(panel_object: PanelObject, target: str | float) -> str:
     """Return a target as text for reports."""
     return str(target) if panel_object.goal is None else panel_object.goal.text(target)
@@ -62,8 +47,16 @@ def check_manipulate(cell: Cell, request: ManipulateRequest, arm: Arm) -> None:
 
 
 def check_mission(cell: Cell, request: MissionRequest, arm: Arm) -> None:
-    """Refuse a mission of which an action is not possible on the cell's panel; see `check_actions`."""
-    check_actions(cell, request.actions or (), arm)
+    """Refuse a mission of which an action is not possible on the cell's panel; see `check_actions`.
+
+    A mission that is taken up is looked at when its task begins.
+    """
+    if request.resume is not None:
+        return
+    checked = mission_of(request, cell)
+    steps = Progress(mission=checked.mission, library=checked.library).all_steps()
+    set_steps = [step for step in steps if isinstance(step, SetStep) and step.object is not None and not step.other]
+    check_actions(cell, [step.action() for step in set_steps], arm)
 
 
 def check_actions(cell: Cell, actions: Sequence[ActionBody], arm: Arm) -> None:

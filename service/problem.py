@@ -27,6 +27,7 @@ STATUS: dict[type[CellError], HTTPStatus] = {
     errors.NotPossibleNow: HTTPStatus.CONFLICT,
     errors.Busy: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.JournalError: HTTPStatus.SERVICE_UNAVAILABLE,
+    errors.StepFailed: HTTPStatus.CONFLICT,
     errors.HistoryError: HTTPStatus.SERVICE_UNAVAILABLE,
     errors.Unauthenticated: HTTPStatus.UNAUTHORIZED,
     errors.Forbidden: HTTPStatus.FORBIDDEN,

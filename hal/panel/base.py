@@ -37,6 +37,8 @@ class PanelObject(Strict, ABC):
     ] = None
     priority: Annotated[Priority, Field(description="of its alarms")] = "medium"
     what_to_do: Annotated[str, Field(max_length=500, description="shown with its alarms")] = ""
+    forbidden: Annotated[bool, Field(description="nothing operates it")] = False
+    confirm: Annotated[bool, Field(description="it is operated only when the request names it a second time")] = False
 
     value_is_angle: ClassVar[bool] = False
     """Whether a value of the object is an angle in radians rather than a value of a scale."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
 
 from hal.panel.families import Round
 from hal.panel.form import Cap, Relief
@@ -19,6 +21,7 @@ class Mushroom(Round):
     travel_m: Positive = 0.006
     spring_n_per_m: Positive = 2000.0
     preload_n: NotNegative = 8.0
+    confirm: Annotated[bool, Field(description="it is operated only when the request names it a second time")] = True
 
     is_round: ClassVar[bool] = True
 

@@ -24,6 +24,7 @@ def demo(
     *,
     cell: CellOption = DEFAULT_CELL,
     seed: SeedOption = None,
+    mission: Annotated[str, typer.Option(help="Name of the mission file; the shipped ones: demo, inspect.")] = "demo",
     judge: Annotated[
         bool, typer.Option("--judge", help="Compare the report with the simulator's truth afterwards.")
     ] = False,
@@ -31,7 +32,7 @@ def demo(
     runs: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("runs"),
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
-    """Run the whole mission and write a report; the exit code is 1 when an action was not confirmed."""
+    """Run a mission file on a cell and write a report; the exit code is 1 when an action was not confirmed."""
     from service.serve import Options, Panelwright, exit_on_sigterm
 
     started_s, before = time.monotonic(), reports(runs)
@@ -45,7 +46,7 @@ def demo(
         try:
             panelwright.start()
             console.print(f"ready after {time.monotonic() - started_s:.1f} s at {panelwright.url}")
-            code = 0 if _mission(panelwright.client(), runs, judge=judge) else 1
+            code = 0 if _mission(panelwright.client(), runs, mission, judge=judge) else 1
         except KeyboardInterrupt:
             console.print("Ctrl-C: stopping the arm and ending all processes")
             code = INTERRUPTED
@@ -57,13 +58,14 @@ def demo(
         leave(code)
 
 
-def _mission(client: Client, runs: Path, *, judge: bool) -> bool:
+def _mission(client: Client, runs: Path, file: str, *, judge: bool) -> bool:
     stop = client.get("/v1/stop")
     if stop["is_latched"]:  # a cell with real devices starts latched; whoever runs the demo states that it is clear
         client.post("/v1/stop/reset", {"seen_count": stop["count"]})
-    task = follow(client, client.post("/v1/missions", {})["id"])
+    task = follow(client, client.post("/v1/missions", {"file": file})["id"])
     result = task["result"] or {"actions": [], "succeeded": False}
-    console.print(_actions(result["actions"]))
+    if result["actions"]:
+        console.print(_actions(result["actions"]))
     mission = reported(client.get("/v1/missions")["missions"], task["id"])
     if mission is not None:
         if judge:

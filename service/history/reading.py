@@ -27,7 +27,7 @@ class StoredReading:
         confidence: expected share of correct answers among such readings.
         guess: what an invalid reading withholds, and its rivals, as JSON; None if nothing is known.
         verb, task, mission: what took it; `mission` is empty outside of missions.
-        asked_by: holder of the lease under which it was asked for; empty without a lease.
+        asked_by: the key, else the holder of the lease, that asked for it; empty without both.
         phase: the part of the work at which it was taken, such as `before the actions`.
         told: what the object was last told to be; None if it never was.
         crop: SHA-256 of the picture of the object; None if there is none.

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from hal.config import Cell
 from hal.devices import DeviceKind
 from service.operations.session import OperationContext, Session, check_looked_for
-from service.schema import fuse_request, fuse_results, mission_results, requests, results
+from service.schema import fuse_request, fuse_results, mission_request, mission_results, requests, results
 
 if TYPE_CHECKING:
     from manipulation import Kinematics
@@ -106,7 +106,7 @@ def _checked_by(function: str) -> Callable[[Cell, Any, Arm], None]:
     return check
 
 
-def _mission(context: OperationContext, request: requests.MissionRequest) -> mission_results.MissionResult:
+def _mission(context: OperationContext, request: mission_request.MissionRequest) -> mission_results.MissionResult:
     from service.operations.mission import run_mission
 
     return run_mission(context, request)
@@ -189,12 +189,13 @@ OPERATIONS: dict[str, Operation] = {
         ),
         Operation(
             name="missions",
-            request_model=requests.MissionRequest,
+            request_model=mission_request.MissionRequest,
             result_model=mission_results.MissionResult,
             run=_mission,
             needs=SENSORS,
-            summary="Run the whole mission and write its report",
-            example={"touches": 4},
+            summary="Run a mission and write its report; without a mission, inspect and touch nothing",
+            example={"file": "demo"},
+            is_still=lambda request: request.dry_run,
             check_with_arm=_checked_by("check_mission"),
         ),
         Operation(

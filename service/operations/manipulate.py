@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from hal.devices import DeviceKind
 from hal.errors import (
     CellError,
     DeviceError,
+    InvalidRequest,
     MotionError,
     NotFound,
     PerceptionError,
     Stopped,
     Unreachable,
 )
-from hal.panel import PanelObject
+from hal.panel import PanelObject, Shown
 from manipulation import ObjectState, Outcome, SkillReport, Verify, free_hand, operate
 from perception.vision import ObjectReading, said
 from service.feasibility import target_of, text_of
@@ -167,6 +169,26 @@ def _after_doubt(
         motions=(*report.motions, *again.motions),
     )
     return both, [shift.finding]
+
+
+def usual_actions(session: Session) -> tuple[ActionBody, ...]:
+    """Return one action for each kind with a mission rank: change the state or value of its best-ranked object."""
+    readings = session.world.readings
+    ranked = [(one.mission_rank, one) for one in session.panel.objects if one.mission_rank is not None]
+    first: dict[str, PanelObject] = {}
+    ranked = [(rank, one) for rank, one in ranked if not one.forbidden and not one.confirm]
+    for _, panel_object in sorted(ranked, key=lambda pair: pair[0]):
+        first.setdefault(panel_object.kind, panel_object)
+    return tuple(other_than_shown(panel_object, readings) for panel_object in first.values())
+
+
+def other_than_shown(panel_object: PanelObject, readings: Mapping[str, ObjectReading]) -> ActionBody:
+    """Return the action that changes the present state or value of the object, or of the object that shows it."""
+    reading, goal = readings.get(panel_object.shown_by), panel_object.goal
+    if goal is None:
+        raise InvalidRequest(f"{panel_object.name} is read only", hint="leave it out of the mission")
+    shown = Shown() if reading is None else Shown(value=reading.value, state=reading.state, text=reading.text)
+    return ActionBody.model_validate({"object": panel_object.name, goal.key: goal.other_than(shown)})
 
 
 def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateResult:

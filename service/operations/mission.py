@@ -1,12 +1,12 @@
-"""The whole mission: locates and reads the panel, touches it, operates its controls, reads them back, and parks."""
+"""Runs a mission: locates the panel, then does the steps of its mission, reports what was found, and parks."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,13 @@ from fusion import Observation, PoseTolerance, error_budget
 from hal.devices import DeviceKind
 from hal.errors import CellError, DeviceError, InvalidRequest, PerceptionError, Unreachable
 from hal.geometry import compose
-from hal.panel import PanelObject, Shown
-from perception.vision import ObjectReading, PanelWay
+from perception.vision import PanelWay
 from service.evaluate import AFTER
-from service.operations.acquisition import settle
+from service.missions.conditions import Seen
+from service.missions.files import mission_of
+from service.missions.interpreter import Interpreter, leaves_of
+from service.missions.progress import FILE, Progress, load_progress
+from service.operations.acquisition import Look, settle
 from service.operations.find_panel import Located, locate, panel_observations, ways_of
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
 from service.operations.locate import (
@@ -31,35 +34,25 @@ from service.operations.locate import (
     rims_in,
     scan_plate,
 )
-from service.operations.manipulate import refused_action, work
-from service.operations.range_detection import (
-    OVERVIEW,
-    SurfaceView,
-    check_surfaces,
-    need_its_place,
-    view_surfaces,
-)
+from service.operations.manipulate import other_than_shown, refused_action, usual_actions, work
+from service.operations.range_detection import OVERVIEW, SurfaceView, check_surfaces, need_its_place, view_surfaces
 from service.operations.sense import feel, fuse_and_remember, fused_result, mounts_of
-from service.operations.session import OperationContext, Session
-from service.operations.travel import leave_the_panel, park
+from service.operations.session import OperationContext, Session, panel_object_or_all
+from service.operations.travel import leave_the_panel, park, plan_mission
 from service.problem import problem_of
 from service.report.drawing import panel_drawing
-from service.report.plots import (
-    joints_picture,
-    lights_picture,
-    png_of,
-    points_picture,
-    range_picture,
-    wrench_picture,
-)
+from service.report.plots import lights_picture, png_of, points_picture, residual_picture
 from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
-from service.schema.mission_results import MissionResult, ObjectPlace, SurfaceCheck
-from service.schema.requests import ActionBody, MissionRequest
+from service.schema.mission_file import FeelStep, InspectStep, SetStep
+from service.schema.mission_request import MissionRequest
+from service.schema.mission_results import MissionResult, ObjectPlace, StepResult, SurfaceCheck
+from service.schema.requests import ActionBody, WantedPose
 from service.schema.results import FittedPlate, FoundBy, estimated
 
 log = logging.getLogger(__name__)
 BEFORE = "before the actions"
+FOUND, WORKED = 0.22, 0.96  # share of the progress at which the panel is found, and at which the steps are done
 
 
 def run_mission(context: OperationContext, request: MissionRequest) -> MissionResult:
@@ -69,21 +62,29 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
     everything that is known.
 
     Raises:
+        InvalidRequest, ConfigError: the mission does not fit the panel, or cannot be taken up; nothing has moved.
         CellError: the error that ended the mission early; the report is written first.
     """
-    connection = context.connection
+    cell = context.connection.cell
+    progress = _progress_of(context, request)
+    if request.dry_run:
+        return plan_mission(Session(context=context), progress)
     name = time.strftime("%Y%m%dT%H%M%S", time.gmtime()) + f"-{context.task.id}"
     record = MissionRecord(
         mission=name,
-        cell=connection.cell.name,
-        panel=connection.cell.panel.name,
-        mode=connection.cell.file.cell.mode,
-        seed=connection.cell.file.cell.seed,
-        now_s=connection.clock.now_s,
+        cell=cell.name,
+        panel=cell.panel.name,
+        mode=cell.file.cell.mode,
+        seed=cell.file.cell.seed,
+        now_s=context.connection.clock.now_s,
     )
+    progress.path = context.runs_dir / name / FILE
+    progress.save()
     session = Session(context=context, record=record)
+    worker = _Worker(session=session, record=record, leaves=leaves_of(progress))
+    interpreter = Interpreter(hands=worker, progress=progress)
     try:
-        _run(session, record, request)
+        _run(worker, interpreter)
     except CellError as error:
         record.problem = problem_of(error)
         _park_after(session, record, error)
@@ -99,7 +100,7 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         _park_after(session, record, defect)
         raise
     finally:
-        _finish(record)
+        record.outcomes = [StepResult.model_validate(asdict(one)) for one in interpreter.outcomes]
         is_reported = _report(record, context.runs_dir / name)
     return MissionResult(
         mission=name,
@@ -108,9 +109,21 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         actions=record.actions,
         fused=record.fused,
         depths=record.depths or [],
+        steps=record.outcomes,
         cell_s=sum(step.cell_s for step in record.steps),
         wall_s=sum(step.wall_s for step in record.steps),
     )
+
+
+def _progress_of(context: OperationContext, request: MissionRequest) -> Progress:
+    """Return the mission that is asked for, with what an earlier mission has done of it."""
+    cell = context.connection.cell
+    if request.resume is not None:
+        progress = load_progress(context.runs_dir / request.resume, cell=cell.name, panel=cell.panel.name)
+        checked = mission_of(MissionRequest(mission=progress.mission), cell)  # the panel file may have changed since
+        return replace(progress, library={**progress.library, **checked.library})
+    checked = mission_of(request, cell)
+    return Progress(mission=checked.mission, library=checked.library, cell=cell.name, panel=cell.panel.name)
 
 
 def _report(record: MissionRecord, folder: Path) -> bool:
@@ -123,42 +136,144 @@ def _report(record: MissionRecord, folder: Path) -> bool:
     return True
 
 
-def _run(session: Session, record: MissionRecord, request: MissionRequest) -> None:
-    tolerance = request.wanted.tolerance()
-    found = _find(session, record, tolerance)
-    with _step(session, "recognise", 0.19, 0.22) as part:
+def _run(worker: _Worker, interpreter: Interpreter) -> None:
+    session, record = worker.session, worker.record
+    tolerance = next(
+        (step.wanted for step in interpreter.progress.all_steps() if isinstance(step, FeelStep)), WantedPose()
+    )
+    worker.found = _find(session, record, tolerance.tolerance())
+    with _step(session, "recognise", 0.19, FOUND) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # until the border lights are out
         overview = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, overview, "recognised")
         need_all_present(overview, session)
         record.objects = _places(session, overview)
-    with _step(session, "read", 0.22, 0.38) as part:
-        read = inspect_close(part, [panel_object.name for panel_object in session.panel.objects])
-        _note_pictures(record, read, "read")
-        part.observer.saw(read.readings.values(), read.crops(), mission=record.mission, phase=BEFORE)
-        record.readings += [reading_result(reading, BEFORE) for reading in read.readings.values()]
-        rims = rims_in(part, [view.look for view in (*overview.pictures, *read.pictures)])
-    with _step(session, "touch", 0.38, 0.55) as part:
-        known = (*found.observations, *rim_observations(rims))
-        felt = feel(part, request.touches, known, tolerance)
-    with _step(session, "fuse", 0.55, 0.57) as part:
-        part.progress(0.0, "fuse rays, range plane, distances and touches")
-        answer = fuse_and_remember(part, (*known, *felt.observations))
-        record.fused = fused_result(answer, felt)
-        record.pictures.append(_drawing(session, found.views[-1]))
-        _note_depths(part, record, rims)
-    checks: list[SurfaceCheck] = []
-    if found.surfaces is not None:
-        with _step(session, "check by surfaces", 0.57, 0.58) as part:
-            part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
-            checks, pictures = check_surfaces(part, found.surfaces)
-            record.by_surfaces = checks
-            record.pictures += pictures
-    _work_all(session, record, request, checks)
-    with _step(session, "retreat", 0.96, 1.0) as part:
+        worker.looks += [view.look for view in overview.pictures]
+    interpreter.run()
+    if record.depths is None:
+        _note_depths(session, record, rims_in(session, worker.looks))
+    with _step(session, "retreat", WORKED, 1.0) as part:
         part.progress(0.0, "park")
         park(part)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Worker:
+    """The hands and eyes of a mission on the cell; see `service.missions.interpreter.Hands`.
+
+    Attributes:
+        leaves: number of steps without steps of their own, by which the progress is shared out.
+        found: the panel as it was located.
+        looks: images in which objects were read, whose rims are fused into the pose.
+        checks: comparison of the objects with their surfaces.
+    """
+
+    session: Session
+    record: MissionRecord
+    leaves: int
+    found: _Found = field(init=False)
+    looks: list[Look] = field(default_factory=list)
+    checks: list[SurfaceCheck] = field(default_factory=list)
+    _begun: int = 0
+    _inspections: int = 0
+
+    def begins(self, path: str, kind: str) -> None:
+        self._begun += kind not in ("choose", "repeat", "call")
+        self.session.part(*self._span(0.0, 0.0)).progress(0.0, f"step {path}")
+
+    def now_s(self) -> float:
+        return self.session.connection.clock.now_s()
+
+    def wait(self, duration_s: float) -> None:
+        end_s = self.now_s() + duration_s
+        while (left_s := end_s - self.now_s()) > 0.0:
+            self.session.part(*self._span(0.0, 0.0)).progress(0.0, "wait", f"{left_s:.0f} s")
+            settle(self.session, min(1.0, left_s))
+
+    def look(self, names: Collection[str]) -> Mapping[str, Seen]:
+        with _step(self.session, "look", *self._span(0.0, 0.3)) as part:
+            seen = inspect_close(part, panel_object_or_all(self.session.panel, names))
+            self._keep(seen, "look")
+        return {name: Seen.of(reading) for name, reading in seen.readings.items()}
+
+    def inspect(self, step: InspectStep) -> None:
+        with _step(self.session, "read", *self._span(0.0, 1.0)) as part:
+            read = inspect_close(part, panel_object_or_all(self.session.panel, step.objects))
+            self._inspections += 1
+            self._keep(read, "read" if self._inspections == 1 else f"read{self._inspections}")
+
+    def feel(self, step: FeelStep) -> None:
+        rims = rims_in(self.session, self.looks)
+        with _step(self.session, "touch", *self._span(0.3, 0.9)) as part:
+            known = (*self.found.observations, *rim_observations(rims))
+            felt = feel(part, step.touches, known, step.wanted.tolerance())
+        with _step(self.session, "fuse", *self._span(0.9, 0.95)) as part:
+            part.progress(0.0, "fuse rays, range plane, distances and touches")
+            answer = fuse_and_remember(part, (*known, *felt.observations))
+            self.record.fused = fused_result(answer, felt)
+            self.record.pictures.append(_drawing(self.session, self.found.views[-1]))
+            _note_depths(part, self.record, rims)
+        self._check_surfaces(*self._span(0.95, 1.0))
+
+    def _check_surfaces(self, low: float, high: float) -> None:
+        """Compare the objects with their surfaces, once."""
+        if self.found.surfaces is None or self.record.by_surfaces is not None:
+            return
+        with _step(self.session, "check by surfaces", low, high) as part:
+            part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
+            self.checks, pictures = check_surfaces(part, self.found.surfaces)
+            self.record.by_surfaces = self.checks
+            self.record.pictures += pictures
+
+    def set(self, step: SetStep) -> str:
+        self._check_surfaces(*self._span(0.0, 0.0))
+        bodies = usual_actions(self.session) if step.each_kind else (self._action(step),)
+        told = []
+        for k, body in enumerate(bodies):
+            with _step(
+                self.session, f"work {body.object}", *self._span(k / len(bodies), (k + 1) / len(bodies))
+            ) as part:
+                told.append(self._work(part, body))
+        return "; ".join(why for why in told if why)
+
+    def _action(self, step: SetStep) -> ActionBody:
+        action = step.action()
+        if not step.other:
+            return action
+        other = other_than_shown(self.session.panel.object(action.object), self.session.world.readings)
+        return other.model_copy(update={"confirm": step.confirm})
+
+    def _work(self, part: Session, body: ActionBody) -> str:
+        """Operate one control; returns why it was not confirmed, empty if it was."""
+        part.progress(0.0, f"work {body.object}")
+        try:
+            need_its_place(self.checks, body.object)
+            deed = work(part, body)
+        except (InvalidRequest, PerceptionError, Unreachable) as refusal:  # the other controls can still be operated
+            part.progress(1.0, f"{body.object} is not operated", refusal.what)
+            self.record.actions.append(refused_action(part.panel.object(body.object), body, refusal))
+            return refusal.what
+        self.record.actions.append(deed.action)
+        if deed.after is not None:
+            self.record.readings.append(reading_result(deed.after, AFTER))
+        if deed.picture is not None:
+            self.record.pictures.append(deed.picture)
+        return "" if deed.action.confirmed else f"{body.object} was not confirmed: {deed.action.detail}"
+
+    def _keep(self, read: Inspection, name: str) -> None:
+        """Store readings and pictures; those after a deed say so, because the evaluation compares them with what is then."""
+        phase = AFTER if self.record.actions else BEFORE
+        self.session.observer.saw(read.readings.values(), read.crops(), mission=self.record.mission, phase=phase)
+        _note_pictures(self.record, read, name)
+        self.record.readings += [reading_result(reading, phase) for reading in read.readings.values()]
+        self.looks += [view.look for view in read.pictures]
+
+    def _span(self, low: float, high: float) -> tuple[float, float]:
+        """Return a part of the progress of the present step, as a range of the mission's."""
+        width = (WORKED - FOUND) / max(self.leaves, 1)
+        begin = min(FOUND + width * max(self._begun - 1, 0), WORKED - width)
+        return begin + low * width, begin + high * width
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -206,54 +321,9 @@ def _pose_error(session: Session, known: Sequence[Observation], tolerance: PoseT
     return tolerance.error_of(budget.covariance, base_from_panel)
 
 
-def _work_all(session: Session, record: MissionRecord, request: MissionRequest, checks: Sequence[SurfaceCheck]) -> None:
-    actions = request.actions if request.actions is not None else usual_actions(session)
-    width = (0.96 - 0.58) / max(len(actions), 1)
-    for k, body in enumerate(actions):
-        with _step(session, f"work {body.object}", 0.58 + k * width, 0.58 + (k + 1) * width) as part:
-            part.progress(0.0, f"work {body.object}")
-            try:
-                need_its_place(checks, body.object)
-                deed = work(part, body)
-            except (
-                InvalidRequest,
-                PerceptionError,
-                Unreachable,
-            ) as refusal:  # the other controls can still be operated
-                part.progress(1.0, f"{body.object} is not operated", refusal.what)
-                record.actions.append(refused_action(part.panel.object(body.object), body, refusal))
-                continue
-            record.actions.append(deed.action)
-            if deed.after is not None:
-                record.readings.append(reading_result(deed.after, AFTER))
-            if deed.picture is not None:
-                record.pictures.append(deed.picture)
-
-
-def usual_actions(session: Session) -> tuple[ActionBody, ...]:
-    """Return one action for each kind with a mission rank: change the state or value of its best-ranked object."""
-    readings = session.world.readings
-    ranked = [(one.mission_rank, one) for one in session.panel.objects if one.mission_rank is not None]
-    first: dict[str, PanelObject] = {}
-    for _, panel_object in sorted(ranked, key=lambda pair: pair[0]):
-        first.setdefault(panel_object.kind, panel_object)
-    return tuple(_other(panel_object, readings) for panel_object in first.values())
-
-
-def _other(panel_object: PanelObject, readings: Mapping[str, ObjectReading]) -> ActionBody:
-    """Return the action that changes the present state or value of the object, or of the object that shows it."""
-    reading, goal = readings.get(panel_object.shown_by), panel_object.goal
-    if goal is None:
-        raise InvalidRequest(f"{panel_object.name} is read only", hint="leave it out of the mission")
-    shown = Shown() if reading is None else Shown(value=reading.value, state=reading.state, text=reading.text)
-    return ActionBody.model_validate({"object": panel_object.name, goal.key: goal.other_than(shown)})
-
-
 @contextmanager
 def _step(session: Session, name: str, low: float, high: float) -> Iterator[Session]:
-    if session.record is None:
-        yield session.part(low, high)
-        return
+    assert session.record is not None  # noqa: S101 - narrowing: a mission has a record
     with session.record.step(name):
         yield session.part(low, high)
 
@@ -274,16 +344,6 @@ def _park_after(session: Session, record: MissionRecord, error: Exception) -> No
         record.not_parked = f"after {error}: {second.what}"
 
 
-def _finish(record: MissionRecord) -> None:
-    if record.motions:
-        record.pictures.append(
-            Picture(name="wrench", title="contact wrench over the mission", png=wrench_picture(record.motions))
-        )
-        record.pictures.append(
-            Picture(name="joints", title="joint angles over the mission", png=joints_picture(record.motions))
-        )
-
-
 def _note_found(record: MissionRecord, found: Located) -> None:
     record.found_by = FoundBy(
         way=found.seen.way.value, base_from_panel=estimated(found.base_from_panel), checks=list(found.checks)
@@ -298,17 +358,9 @@ def _note_found(record: MissionRecord, found: Located) -> None:
 
 
 def _note_plane(record: MissionRecord, plane: ScannedPlane) -> None:
-    c, depth = plane.scan.capabilities, plane.scan.depth_m
-    v, u = np.mgrid[: c.height, : c.width]
-    points = np.stack([(u - c.cx) / c.fx * depth, (v - c.cy) / c.fy * depth, depth], axis=-1)
-    feature = plane.fit.feature
-    record.pictures.append(
-        Picture(
-            name="range",
-            title="range image and what stands out of the fitted plate",
-            png=range_picture(depth, -(points - feature.point_m) @ (-feature.direction)),
-        )
-    )
+    c, feature = plane.scan.capabilities, plane.fit.feature
+    png = residual_picture(plane.scan.depth_m, (c.fx, c.fy, c.cx, c.cy), feature.point_m, feature.direction)
+    record.pictures.append(Picture(name="range", title="range image and what stands out of the fitted plate", png=png))
     record.plate_in_scanner = FittedPlate(
         point_m=feature.point_m.tolist(),
         normal=feature.direction.tolist(),

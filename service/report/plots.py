@@ -76,6 +76,16 @@ def points_picture(image: Pixels, points_px: NDArray[Any], names: Sequence[str])
     return figure_png(figure)
 
 
+def residual_picture(
+    depth_m: NDArray[Any], lens: tuple[float, float, float, float], point_m: NDArray[Any], normal: NDArray[Any]
+) -> bytes:
+    """Draw a range image of a pinhole scanner (fx, fy, cx, cy) and its residuals from a plane."""
+    fx, fy, cx, cy = lens
+    v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
+    points = np.stack([(u - cx) / fx * depth_m, (v - cy) / fy * depth_m, depth_m], axis=-1)
+    return range_picture(depth_m, -(points - point_m) @ (-normal))
+
+
 def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     """Draw the range image and its residuals from the fitted plane."""
     figure = sheet(4.2)

@@ -12,7 +12,14 @@ from hal.errors import CellError
 from hal.motion import MotionReport
 from service.problem import ProblemFields
 from service.schema.fuse_results import FuseResult
-from service.schema.mission_results import ActionResult, ObjectDepth, ObjectPlace, ReadingResult, SurfaceCheck
+from service.schema.mission_results import (
+    ActionResult,
+    ObjectDepth,
+    ObjectPlace,
+    ReadingResult,
+    StepResult,
+    SurfaceCheck,
+)
 from service.schema.results import FittedPlate, FoundBy
 
 # Fields of a record that appear in a report once they are known.
@@ -49,6 +56,7 @@ class MissionRecord:
         objects: the position of each object in 3-D.
         fused, found_by: the panel's pose from all sensors, and from the camera alone.
         by_surfaces: results from the objects' surfaces, in addition to layout and vision.
+        outcomes: how each step of the mission ended.
         depths: how far the objects stand out of the plate by several camera views, beside the panel file.
         not_parked: why the arm was not parked after an error.
     """
@@ -63,6 +71,7 @@ class MissionRecord:
     steps: list[Step] = field(default_factory=list)
     readings: list[ReadingResult] = field(default_factory=list)
     actions: list[ActionResult] = field(default_factory=list)
+    outcomes: list[StepResult] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
     motions: list[MotionReport] = field(default_factory=list)
     plate_in_scanner: FittedPlate | None = None
@@ -102,8 +111,9 @@ class MissionRecord:
 
     @property
     def succeeded(self) -> bool:
-        """Whether every action was confirmed and nothing failed."""
-        return self.problem is None and bool(self.actions) and all(action.confirmed for action in self.actions)
+        """Whether every action was confirmed, no step was skipped, and nothing failed."""
+        is_whole = all(one.outcome in ("done", "taken over") for one in self.outcomes)
+        return self.problem is None and is_whole and all(action.confirmed for action in self.actions)
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of `report.json`, without the pictures."""
@@ -123,6 +133,7 @@ class MissionRecord:
             "steps": self.steps,
             "readings": self.readings,
             "actions": self.actions,
+            "mission_steps": self.outcomes,
             **{name: value for name in FINDINGS if (value := getattr(self, name)) is not None},
             "pictures": [f"{picture.name}.png" for picture in self.pictures],
             "problem": self.problem,

@@ -10,7 +10,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from hal.atomic_write import write_atomically
 from service.jsonable import jsonable
-from service.report.record import MissionRecord
+from service.report.plots import joints_picture, wrench_picture
+from service.report.record import MissionRecord, Picture
 
 TEMPLATES = Path(__file__).parent
 
@@ -18,6 +19,10 @@ TEMPLATES = Path(__file__).parent
 def write_report(record: MissionRecord, folder: Path) -> Path:
     """Write the report into `folder`, created if missing; returns the path of `report.html`."""
     folder.mkdir(parents=True, exist_ok=True)
+    if record.motions:
+        wrench, joints = wrench_picture(record.motions), joints_picture(record.motions)
+        record.pictures.append(Picture(name="wrench", title="contact wrench over the mission", png=wrench))
+        record.pictures.append(Picture(name="joints", title="joint angles over the mission", png=joints))
     for picture in record.pictures:
         (folder / f"{picture.name}.png").write_bytes(picture.png)
     summary: dict[str, Any] = jsonable(record.summary())

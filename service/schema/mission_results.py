@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from service.schema.fuse_results import FuseResult
 from service.schema.results import Numbers, Pictures, Result
 
@@ -77,10 +79,51 @@ class ObjectDepth(Result):
     finding: str
 
 
+class StepResult(Result):
+    """How a step of a mission ended; `path` is its name, after those of the steps that it belongs to.
+
+    `taken over` is a step that the mission before had finished.
+    """
+
+    path: str
+    kind: str
+    outcome: Literal["done", "taken over", "skipped", "failed"]
+    detail: str = ""
+
+
+class PlannedStation(Result):
+    """A place to which a planned mission drives, the time of the way there, and why there is none; from the place before.
+
+    `problem` is null where there is a way that is free of collisions.
+    """
+
+    step: str
+    what: str
+    way_s: float | None
+    problem: str | None
+
+
+class MissionPlan(Result):
+    """What a mission would do: its stations in order, and the time on the cell's clock.
+
+    `contact_s` is an estimate for the work at the controls, whose length depends on what the hand feels. Conditions are
+    taken as met, and a step that may run several times is planned once; `located` says whether the panel's pose has been
+    measured, or is the one that the cell file expects.
+    """
+
+    stations: list[PlannedStation]
+    is_possible: bool
+    located: bool
+    ways_s: float
+    contact_s: float
+    expected_s: float
+
+
 class MissionResult(Result):
     """The result of a mission; `report` is the address of its report, null when it could not be written.
 
-    `depths` compares the objects' depths with the panel file; an entry that `contradicts` is a warning.
+    `depths` compares the objects' depths with the panel file; an entry that `contradicts` is a warning. `plan` is the answer
+    to a dry run, which does nothing else.
     """
 
     mission: str
@@ -89,6 +132,8 @@ class MissionResult(Result):
     actions: list[ActionResult]
     fused: FuseResult | None
     depths: list[ObjectDepth]
+    steps: list[StepResult] = []
+    plan: MissionPlan | None = None
     cell_s: float
     wall_s: float
 

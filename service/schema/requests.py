@@ -171,6 +171,10 @@ class ActionBody(Strict):
     """One action: `state` for levers, toggles, rotaries and buttons, `value` for sliders, `angle_rad` for handwheels."""
 
     object: ObjectName
+    confirm: Annotated[
+        ObjectName | None,
+        Field(description="the object's name again, for a control that asks for it, such as an emergency mushroom"),
+    ] = None
     state: Annotated[str, Field(max_length=41)] | None = None
     value: float | None = None
     angle_rad: Annotated[float, Field(ge=-100.0, le=100.0)] | None = None
@@ -188,14 +192,6 @@ class ManipulateRequest(ActionBody):
     verify: Annotated[
         bool, Field(description="look at the control afterwards; if false, only what the fingers feel can confirm it")
     ] = True
-
-
-class MissionRequest(Strict):
-    """The whole mission. Without `actions` one lever, one slider, one button and one toggle are operated."""
-
-    actions: Annotated[tuple[ActionBody, ...], Field(max_length=50)] | None = None
-    touches: Touches = 4
-    wanted: WantedPose = WantedPose()
 
 
 class CalibrationRequest(Strict):

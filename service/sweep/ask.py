@@ -56,7 +56,7 @@ class Asked:
         for deed in self.deeds:
             began_s = _truth(self.server).sim_time_s
             _clear_stop(self.client)
-            answer = _said(_ended(self.client, "/v1/manipulate", deed.body))
+            answer = _said(_ended(self.client, "/v1/manipulate", deed.asked))
             truth = _truth(self.server, began_s)
             answer["cell_s"] = truth.sim_time_s - began_s
             judged.append(judge(self.seed, deed, self.panel, answer, truth))
@@ -94,12 +94,12 @@ class Asked:
 
     def _mission(self) -> tuple[dict[str, Any], dict[str, Answer]]:
         """Run all deeds in one mission; deeds that are refused are left out, and returned as answers by object."""
-        task = _ended(self.client, "/v1/missions", {"actions": [deed.body for deed in self.deeds]})
+        task = _ended(self.client, "/v1/missions", {"actions": [deed.asked for deed in self.deeds]})
         details = (task["problem"] or {}).get("details") or {}
         if not details.get("faults"):
             return task, {}
         refused = {name: {**_said(task), "cell_s": 0.0} for name in details["objects"]}
-        rest = [deed.body for deed in self.deeds if deed.object not in refused]
+        rest = [deed.asked for deed in self.deeds if deed.object not in refused]
         return _ended(self.client, "/v1/missions", {"actions": rest}), refused
 
 

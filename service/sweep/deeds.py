@@ -37,6 +37,11 @@ class Deed:
     may_be_stiff: bool = False
 
     @property
+    def asked(self) -> dict[str, Any]:
+        """The body of the request, with the object named twice for the controls that ask for it."""
+        return {**self.body, "confirm": self.object}
+
+    @property
     def goal(self) -> str | float:
         """The state or the number that is asked for."""
         goal: str | float = next(value for key, value in self.body.items() if key != "object")

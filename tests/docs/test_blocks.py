@@ -18,7 +18,7 @@ from tests.docs.blocks import ROOT, Block, blocks, page_name
 
 LEAST_REASON = 10  # characters
 LIMIT_S = 240.0
-LINKED = (".venv", "benchmarks", "cells", "docs", "examples", "panels")
+LINKED = (".venv", "benchmarks", "cells", "docs", "examples", "missions", "panels")
 BLOCKS = list(blocks())
 RUN_PAGES = sorted({block.page for block in BLOCKS if not block.mark})
 

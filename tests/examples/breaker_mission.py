@@ -17,7 +17,8 @@ from service.operations.recognise import run_recognise
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
-from service.schema.requests import MissionRequest, RecogniseRequest
+from service.schema.mission_request import MissionRequest
+from service.schema.requests import RecogniseRequest
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
 from service.world_model import WorldModel
@@ -34,7 +35,7 @@ def main(folder: Path, seed: int) -> None:
         connection = LocalConnection(cell, runtime.objects, close=runtime.close)
         task = TaskContext(Task(id="test", verb="missions", request={}, moves=True), folder / "artefacts")
         context = OperationContext(connection=connection, task=task, runs_dir=folder / "runs", world=WorldModel())
-        run_mission(context, MissionRequest())
+        run_mission(context, MissionRequest(file="demo"))
         (report,) = folder.glob("runs/*/report.json")
         verdict = evaluate(connection, report.parent)
         found = run_recognise(Session(context=context), RecogniseRequest(mode="blind")).candidates

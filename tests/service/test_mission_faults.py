@@ -48,7 +48,7 @@ class Bench:
     def begin_mission(self) -> str:
         """Start a mission; return its URL when the arm moves."""
         self.client.post("/v1/stop/reset", json={"seen_count": self.client.get("/v1/stop").json()["count"]})
-        url = self.client.post("/v1/missions", json={}).headers["location"]
+        url = self.client.post("/v1/missions", json={"file": "demo"}).headers["location"]
         eventually(lambda: self.task(url)["state"] == "running", timeout_s=120.0)
         eventually(lambda: self.task(url)["fraction"] > 0.06, timeout_s=300.0)
         return url

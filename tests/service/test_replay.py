@@ -21,7 +21,8 @@ from service.operations import OPERATIONS, Operation, OperationContext
 from service.recording.reader import open_recording
 from service.replay.book import Book, distance, replayed_cell
 from service.replay.verdict import Verdict, differing, replay_tasks
-from service.schema.requests import MissionRequest, WantedPose
+from service.schema.mission_request import MissionRequest
+from service.schema.requests import WantedPose
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 from tests.service.recording import conftest, looks

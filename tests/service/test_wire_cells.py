@@ -107,7 +107,12 @@ def judged_mission(panelwright: Panelwright) -> tuple[list[str], str]:
     stop = client.get("/v1/stop")
     assert stop["is_latched"], "a cell with real parts starts stopped"
     client.post("/v1/stop/reset", {"seen_count": stop["count"]})
-    task = client.post("/v1/missions", {"touches": 3, "wanted": {"position_m": 0.0005, "angle_rad": 0.0005}})
+    steps = [
+        {"kind": "inspect", "name": "read"},
+        {"kind": "feel", "name": "feel", "touches": 3, "wanted": {"position_m": 0.0005, "angle_rad": 0.0005}},
+        {"kind": "set", "name": "operate", "each_kind": True, "on_failure": "skip"},
+    ]
+    task = client.post("/v1/missions", {"mission": {"steps": steps}})
     told = [json.dumps(event) for event in client.events(task["id"])]
     (mission,) = client.get("/v1/missions")["missions"]
     client.post("/v1/judge?wait_s=30", {"mission": mission["name"]})

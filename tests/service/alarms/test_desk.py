@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,8 @@ import pytest
 
 from hal.errors import ConfigError, InvalidRequest
 from hal.panel import Panel
-from hal.strict import validate
+from hal.strict import parse_toml, validate
+from service.alarms.conditions import Watch
 from service.alarms.desk import THE_CELL, AlarmDesk
 from service.alarms.lifecycle import State
 from service.errors import JournalError, NoSuchTask
@@ -237,6 +239,16 @@ def test_a_limit_that_cannot_be_meant_is_refused_with_its_key(tmp_path: Path, ke
         Rig(tmp_path, **keys)
     assert words in caught.value.what
     assert "objects.0" in caught.value.what
+
+
+def test_the_objects_of_the_page_are_watched() -> None:
+    page = (Path(__file__).parents[3] / "docs/how-to/watch-limits.md").read_text()
+    (block,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    panel = parse_toml('name = "p"\nwidth_m = 0.6\nheight_m = 0.5\n' + block, Panel, source="page")
+    assert [Watch(panel_object=one, valid_at_s=0.0).kinds for one in panel.objects] == [
+        ("low_low", "low", "high", "high_high", "rate", "stale", "refused"),
+        ("state", "refused"),
+    ]
 
 
 def test_all_faults_of_limits_and_states_are_told_at_once() -> None:

@@ -11,7 +11,7 @@ from service.operations import OPERATIONS
 from service.problem import STATUS
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "http.md"
-NOT_SHOWN = {"/v1/echo", "/v1/hold", "/v1/wait", "/v1/fail", "/v1/measure"}  # verbs of these tests
+NOT_SHOWN = {"/v1/echo", "/v1/hold", "/v1/wait", "/v1/fail", "/v1/measure", "/v1/note"}  # verbs of these tests
 
 
 def _documented() -> set[str]:

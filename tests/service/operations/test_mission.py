@@ -18,9 +18,12 @@ from hal.config import load_cell
 from hal.errors import CellError, DeviceFault, InvalidRequest, NotFound
 from hal.motion import DeclaredMotion, MotionReport
 from hal.simulated import Fault, ObjectTruth, Truth
+from hal.strict import validate
+from service.errors import StepFailed
 from service.evaluate import evaluate
 from service.history.observer import Observations
 from service.history.store import History
+from service.missions.progress import load_progress
 from service.operations.acquisition import look, settle
 from service.operations.find_panel import locate
 from service.operations.inspect import look_close
@@ -31,7 +34,9 @@ from service.operations.session import OperationContext, Session
 from service.operations.travel import go_to_joints
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
-from service.schema.requests import ActionBody, MissionRequest
+from service.schema.mission_file import MissionFile
+from service.schema.mission_request import MissionRequest
+from service.schema.requests import ActionBody
 from service.tasks.model import Task
 from service.tasks.store import TaskContext
 from service.world_model import WorldModel
@@ -151,6 +156,40 @@ def assert_everything_was_stored(folder: Path, report: dict[str, Any]) -> None:
     assert len(sizes) == len(stored) and all(16 < side < 480 for size in sizes for side in size)
 
 
+UNMET = {"object": "pressure", "above": 11.0, "unit": "bar"}  # beyond the scale
+GUARDED = {
+    "steps": [
+        {"kind": "inspect", "name": "read", "objects": ["pressure", "flow"]},
+        {"kind": "set", "name": "skipped", "object": "pump", "other": True, "needs": [UNMET], "on_failure": "skip"},
+        {"kind": "set", "name": "press", "object": "start", "needs": [UNMET]},
+    ]
+}
+
+
+def test_a_mission_is_planned_without_motion_and_ends_before_contact_when_a_condition_is_unmet(tmp_path: Path) -> None:
+    with mission_context(tmp_path, seed=3) as context:
+        stood = context.connection.mover.state().position_rad.tolist()
+        plan = run_mission(context, MissionRequest(file="demo", dry_run=True)).plan
+        assert plan is not None and plan.is_possible and not plan.located
+        assert {"overview", "park"} <= {station.what for station in plan.stations}
+        assert [station.step for station in plan.stations].count("operate") == 4
+        assert plan.expected_s == pytest.approx(plan.ways_s + plan.contact_s) and 30.0 < plan.expected_s < 300.0
+        assert context.connection.mover.state().position_rad.tolist() == stood
+        assert not list(tmp_path.glob("runs/*"))
+        guarded = validate(GUARDED, MissionFile, source="mission")
+        with pytest.raises(StepFailed, match="step press was ended before it did anything: pressure shows"):
+            run_mission(context, MissionRequest(mission=guarded))
+        truth = context.connection.device("arm").truth()
+    report = report_of(tmp_path)
+    assert truth.peak_force_n < 1.0 and not report["actions"]
+    outcomes = [(one["path"], one["outcome"]) for one in report["mission_steps"]]
+    assert outcomes == [("read", "done"), ("skipped", "skipped"), ("press", "failed")]
+    assert {one["name"] for one in report["readings"]} == {"pressure", "flow"}
+    assert report["steps"][-1]["name"] == "park after the error" and report["steps"][-1]["ok"]
+    (folder,) = tmp_path.glob("runs/*/progress.json")
+    assert load_progress(folder.parent, cell="bench", panel="bench").done == ["read"]
+
+
 def test_a_control_that_cannot_be_operated_keeps_the_mission_from_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,7 +250,7 @@ def test_a_device_that_dies_ends_the_mission_by_name_and_nothing_is_lost(tmp_pat
             stand_close(Session(context=context))  # as after an action; the mission must be able to leave this pose
         context.connection.device(device).inject_fault(Fault.DISCONNECTED)
         with pytest.raises(CellError) as caught:
-            run_mission(context, MissionRequest())
+            run_mission(context, MissionRequest(file="demo"))
         state = context.connection.mover.state()
     assert device in str(caught.value)
     report = report_of(tmp_path)
@@ -234,7 +273,7 @@ def test_an_arm_that_does_not_follow_is_left_where_it_stands(tmp_path: Path) -> 
         mover.execute = noted  # type: ignore[method-assign]  # records every motion of the mission and after it
         context.connection.device("arm").inject_fault(Fault.FROZEN)
         with pytest.raises(DeviceFault, match="does not follow"):
-            run_mission(context, MissionRequest())
+            run_mission(context, MissionRequest(file="demo"))
     assert [report.tripped == "tracking" for report in reports] == [False] * (len(reports) - 1) + [True]
     report = report_of(tmp_path)
     assert "arm does not follow" in report["not_parked"]
@@ -257,4 +296,4 @@ def test_a_frozen_camera_is_found_out(tmp_path: Path) -> None:
     with mission_context(tmp_path, seed=4) as context:
         context.connection.device("wrist_camera").inject_fault(Fault.FROZEN)
         with pytest.raises(CellError, match="same frame"):
-            run_mission(context, MissionRequest())
+            run_mission(context, MissionRequest(file="demo"))

@@ -13,7 +13,7 @@ from hal.errors import InvalidRequest, NoRoom, OutOfReach
 from manipulation import Kinematics
 from service.feasibility import target_of
 from service.operations import OPERATIONS
-from service.operations.mission import usual_actions
+from service.operations.manipulate import usual_actions
 from service.problem import status_of
 from service.schema.requests import ActionBody
 from service.world_model import WorldModel
@@ -34,7 +34,7 @@ def no_arm() -> None:
         ({"object": "bypass", "angle_rad": 0.5}, 0.5),
         ({"object": "main_valve", "state": "open"}, "open"),
         ({"object": "pump", "state": "on"}, "on"),
-        ({"object": "emergency"}, "pressed"),
+        ({"object": "emergency", "confirm": "emergency"}, "pressed"),
         ({"object": "start"}, "on"),
         ({"object": "hold"}, "pressed"),
         ({"object": "hold", "state": "released"}, "released"),
@@ -55,6 +55,8 @@ NONSENSE = [
     ({"object": "start", "state": "pressed"}, "no state 'pressed'", "on, off"),
     ({"object": "hold", "state": "on"}, "no state 'on'", "pressed, released"),
     ({"object": "pressure", "value": 3.0}, "cannot be operated", "lever"),
+    ({"object": "emergency"}, "only when it is named twice", "confirm = 'emergency'"),
+    ({"object": "emergency", "confirm": "pump"}, "confirm names 'pump'", "confirm = 'emergency'"),
 ]
 
 

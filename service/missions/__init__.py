@@ -1,0 +1,1 @@
+"""Mission files: found, checked against a panel, and run step by step by anything that has hands and eyes."""

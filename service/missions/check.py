@@ -1,0 +1,208 @@
+"""Checks a mission against the panel: all faults at once, with file, key and remedy, before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from hal.entry_points import registered
+from hal.errors import CellError, InvalidRequest
+from hal.panel import Panel, PanelObject
+from hal.panel.kinds import SKILLS, has_part
+from hal.panel.limits import unit_of
+from hal.strict import FieldFault
+from service.schema.mission_file import (
+    CallStep,
+    ChooseStep,
+    Condition,
+    InspectStep,
+    MissionFile,
+    RepeatStep,
+    RequireStep,
+    SetStep,
+    Step,
+    WaitStep,
+)
+from service.schema.requests import ActionBody
+
+Load = Callable[[str], MissionFile]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checked:
+    """A mission that fits the panel, with the missions that it calls, by name."""
+
+    mission: MissionFile
+    library: Mapping[str, MissionFile]
+
+
+def check_mission(mission: MissionFile, panel: Panel, load: Load, *, source: str) -> Checked:
+    """Check a mission and all that it calls.
+
+    Args:
+        load: returns the mission file of a name; raises `CellError`.
+        source: name of the mission in errors.
+
+    Raises:
+        InvalidRequest: names every fault.
+    """
+    library: dict[str, MissionFile] = {}
+    faults = [(source, fault) for fault in _faults_of(mission.steps, "steps", panel)]
+    waiting = [(source, key, name) for key, name in _calls(mission.steps, "steps")]
+    calls = {source: {name for _, _, name in waiting}}
+    while waiting:
+        caller, key, name = waiting.pop(0)
+        if name in library:
+            continue
+        try:
+            library[name] = load(name)
+        except CellError as error:
+            faults.append((caller, FieldFault(f"{key}.mission", error.what, error.hint)))
+            continue
+        below = list(_calls(library[name].steps, "steps"))
+        calls[name] = {called for _, called in below}
+        faults += [(f"missions/{name}.toml", fault) for fault in _faults_of(library[name].steps, "steps", panel)]
+        waiting += [(f"missions/{name}.toml", inner, called) for inner, called in below]
+    faults += [(source, fault) for fault in _circles(calls)]
+    if faults:
+        raise _refusal(faults)
+    return Checked(mission=mission, library=library)
+
+
+def _refusal(faults: Sequence[tuple[str, FieldFault]]) -> InvalidRequest:
+    told = [f"{source}: {fault}" for source, fault in faults]
+    source, first = faults[0]
+    more = f" (and {len(told) - 1} more {'fault' if len(told) == 2 else 'faults'})" if len(told) > 1 else ""
+    return InvalidRequest(
+        f"{source}: {first.key}: {first.text}{more}", hint=first.hint, file=source, key=first.key, faults=told
+    )
+
+
+def operable(panel_object: PanelObject, action: ActionBody) -> None:
+    """Raise `InvalidRequest` for a control that is forbidden, or that is to be named a second time and is not."""
+    name = panel_object.name
+    if panel_object.forbidden:
+        raise InvalidRequest(f"{name} is forbidden in the panel file", hint="a person operates it; leave it out")
+    if action.confirm is not None and action.confirm != name:
+        what = f"confirm names {action.confirm!r}, and the object is {name!r}"
+        raise InvalidRequest(what, hint=f"write confirm = {name!r} if that is meant")
+    if panel_object.confirm and action.confirm is None:
+        what = f"{name} is a {panel_object.kind} that is operated only when it is named twice"
+        raise InvalidRequest(what, hint=f"add confirm = {name!r} if that is meant")
+
+
+def target_of(panel_object: PanelObject, action: ActionBody) -> str | float:
+    """Return the target of an action; the usual target of the kind when the request names none.
+
+    Raises:
+        InvalidRequest: the object cannot or may not be operated, or has no such state or value.
+    """
+    goal = panel_object.goal
+    if goal is None or not has_part(SKILLS, panel_object.kind):
+        raise InvalidRequest(
+            f"{panel_object.name} is a {panel_object.kind}, which cannot be operated: it is read only",
+            hint=f"kinds that can be: {', '.join(registered(SKILLS))}",
+        )
+    for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # refused, because its meaning would be a guess
+        if getattr(action, other) is not None:
+            hint = f"send {{'object': '{panel_object.name}', '{goal.key}': ...}}"
+            what = f"{panel_object.name} is a {panel_object.kind}: it takes {goal.key}, not {other}"
+            raise InvalidRequest(what, hint=hint)
+    target = goal.checked(panel_object.name, getattr(action, goal.key))
+    operable(panel_object, action)
+    return target
+
+
+def _faults_of(steps: Sequence[Step], at: str, panel: Panel) -> Iterator[FieldFault]:
+    for k, step in enumerate(steps):
+        key = f"{at}.{k}"
+        yield from _faulty_conditions(step.needs, f"{key}.needs", panel)
+        match step:
+            case InspectStep():
+                for j, name in enumerate(step.objects or ()):
+                    yield from _said(f"{key}.objects.{j}", partial(panel.object, name))
+            case SetStep(object=str(name)):
+                yield from _said(f"{key}.object", partial(_check_set, step, name, panel))
+            case RequireStep() | WaitStep():
+                yield from _faulty_conditions(step.conditions, f"{key}.conditions", panel)
+            case ChooseStep():
+                yield from _faulty_conditions(step.when, f"{key}.when", panel)
+                yield from _faults_of(step.then, f"{key}.then", panel)
+                yield from _faults_of(step.otherwise, f"{key}.otherwise", panel)
+            case RepeatStep():
+                yield from _faulty_conditions(step.until, f"{key}.until", panel)
+                yield from _faults_of(step.steps, f"{key}.steps", panel)
+
+
+def _check_set(step: SetStep, name: str, panel: Panel) -> None:
+    panel_object = panel.object(name)
+    if not step.other:
+        target_of(panel_object, step.action())
+        return
+    if panel_object.goal is None:
+        raise InvalidRequest(f"{panel_object.name} cannot be operated: it is read only", hint="leave the step out")
+    operable(panel_object, step.action())
+
+
+def _faulty_conditions(conditions: Sequence[Condition], at: str, panel: Panel) -> Iterator[FieldFault]:
+    for k, condition in enumerate(conditions):
+        key = f"{at}.{k}"
+        try:
+            panel_object = panel.object(condition.object)
+        except InvalidRequest as error:
+            yield FieldFault(f"{key}.object", error.what, error.hint)
+            continue
+        yield from _faulty_condition(condition, key, panel_object)
+
+
+def _faulty_condition(condition: Condition, key: str, panel_object: PanelObject) -> Iterator[FieldFault]:
+    name, states, unit = panel_object.name, panel_object.states_shown, unit_of(panel_object)
+    if condition.state is not None:
+        if not states and panel_object.full_scale is not None:
+            yield FieldFault(f"{key}.state", f"{name} shows a value and no state", "give below or above")
+        elif states and condition.state not in states:
+            yield FieldFault(f"{key}.state", f"{name} has no state {condition.state!r}", f"states: {', '.join(states)}")
+        return
+    if states:
+        hint = f"give state; its states: {', '.join(states)}"
+        yield FieldFault(key, f"{name} shows states and no value", hint)
+    elif condition.unit != (unit or None):
+        told = f"the unit of {name} is {unit!r}" if unit else f"{name} has no unit"
+        given = "none is given" if condition.unit is None else f"{condition.unit!r} is given"
+        yield FieldFault(f"{key}.unit", f"{told}, and {given}", f"write unit = {unit!r}" if unit else "leave unit out")
+
+
+def _said(key: str, work: Callable[[], object]) -> Iterator[FieldFault]:
+    try:
+        work()
+    except InvalidRequest as error:
+        yield FieldFault(key, error.what, error.hint)
+
+
+def _calls(steps: Sequence[Step], at: str) -> Iterator[tuple[str, str]]:
+    """Yield the key and the mission of each call, also within other steps."""
+    for k, step in enumerate(steps):
+        key = f"{at}.{k}"
+        match step:
+            case CallStep():
+                yield key, step.mission
+            case ChooseStep():
+                yield from _calls(step.then, f"{key}.then")
+                yield from _calls(step.otherwise, f"{key}.otherwise")
+            case RepeatStep():
+                yield from _calls(step.steps, f"{key}.steps")
+
+
+def _circles(calls: Mapping[str, set[str]]) -> Iterator[FieldFault]:
+    """Yield a fault for each mission that calls itself, directly or through others."""
+    for name in calls:
+        seen: set[str] = set()
+        waiting = set(calls[name])
+        while waiting:
+            one = waiting.pop()
+            if one not in seen:
+                seen.add(one)
+                waiting |= calls.get(one, set())
+        if name in seen:
+            yield FieldFault("steps", f"mission {name!r} calls itself", "take one call of the circle out")

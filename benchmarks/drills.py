@@ -102,7 +102,7 @@ def _body(name: str, now: dict[str, ObjectTruth]) -> dict[str, Any]:
     if one.goal is None:
         raise ValueError(f"{name} cannot be operated")
     other = one.goal.other_than(shown_of(now[one.shown_by]))
-    return {"object": name, one.goal.key: other}
+    return {"object": name, one.goal.key: other, "confirm": name}
 
 
 def _truth(server: Panelwright) -> Truth:

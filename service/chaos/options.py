@@ -23,7 +23,7 @@ class ChaosOptions:
     minutes: float = 30.0
     rounds: int | None = None
     verb: str = "missions"
-    body: dict[str, object] = field(default_factory=dict)
+    body: dict[str, object] = field(default_factory=lambda: {"file": "demo"})
     longest_s: float = 12.0
     patience: float = 1.0
     faults: tuple[str, ...] = ()

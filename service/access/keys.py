@@ -29,6 +29,7 @@ from service.errors import KeysUnusable
 FILE = "keys.json"
 MODE = 0o600
 KEY_BYTES = 32
+OWN = "this-program"  # a name that no stored key has
 PREFIX = "pw_"  # so that scanners for secrets recognise a key
 PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}")
 Commit = Callable[[str, dict[str, Any]], None]
@@ -84,7 +85,8 @@ class KeyBook:
         self._keys: tuple[Key, ...] = ()
         self._by_hash: dict[str, Key] = {}
         self._had_keys = False
-        self._own: Key | None = None
+        self._own_secret = _new_secret()
+        self._own = Key(name=OWN, role=Role.MAINTAINER, sha256=_hash(self._own_secret), added_s=now())
 
     def all(self) -> tuple[Key, ...]:
         """Return all keys, also revoked and expired ones.
@@ -117,16 +119,14 @@ class KeyBook:
         return tuple(key for key in self.all() if key.is_active(self._now()))
 
     def own(self) -> str:
-        """Return a new key for this program's own client, which is kept in memory only and ends with the program."""
-        secret = PREFIX + secrets.token_urlsafe(KEY_BYTES)
-        self._own = Key(name="this-program", role=Role.MAINTAINER, sha256=_hash(secret), added_s=self._now())
-        return secret
+        """Return the key for this program's own clients, which is kept in memory only and ends with the program."""
+        return self._own_secret
 
     def find(self, secret: str) -> Key | None:
         """Return the active key with this secret, or None."""
         self.all()
         digest = _hash(secret)
-        key = self._own if self._own is not None and self._own.sha256 == digest else self._by_hash.get(digest)
+        key = self._own if self._own.sha256 == digest else self._by_hash.get(digest)
         if key is None or not hmac.compare_digest(key.sha256, digest) or not key.is_active(self._now()):
             return None
         return key
@@ -145,9 +145,9 @@ class KeyBook:
         Raises:
             InvalidRequest: the name is not plain, or an active key has it.
         """
-        if not PLAIN_NAME.fullmatch(name):
+        if not PLAIN_NAME.fullmatch(name) or name == OWN:
             raise InvalidRequest(f"{name[:40]!r} is no name of a key", hint="letters, digits and - _ . @, at most 64")
-        secret = PREFIX + secrets.token_urlsafe(KEY_BYTES)
+        secret = _new_secret()
         now_s = self._now()
         expires_s = None if valid_s is None else now_s + valid_s
         key = Key(name=name, role=role, sha256=_hash(secret), added_s=now_s, expires_s=expires_s)
@@ -219,6 +219,10 @@ def key_from_file(path: Path) -> str:
     if not text:
         raise ConfigError(f"the key file {path} is empty", hint="write the key into it that `keys add` showed")
     return text
+
+
+def _new_secret() -> str:
+    return PREFIX + secrets.token_urlsafe(KEY_BYTES)
 
 
 def _hash(secret: str) -> str:

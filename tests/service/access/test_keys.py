@@ -101,7 +101,7 @@ def test_a_key_is_recorded_before_it_is_valid(kept: Book) -> None:
     assert kept.book.named("bob") is None
 
 
-@pytest.mark.parametrize("name", ["", "../x", "a b", "ä", "x" * 65, "<b>"])
+@pytest.mark.parametrize("name", ["", "../x", "a b", "ä", "x" * 65, "<b>", "this-program"])
 def test_a_name_is_plain(kept: Book, name: str) -> None:
     with pytest.raises(InvalidRequest):
         kept.add(name)
@@ -114,6 +114,16 @@ def test_a_name_belongs_to_one_active_key(kept: Book) -> None:
     kept.revoke("alice")
     second = kept.add("alice", Role.OBSERVER)
     assert kept.book.find(first) is None and kept.book.find(second) is not None
+
+
+def test_a_program_has_one_key_of_its_own_that_is_stored_nowhere(kept: Book) -> None:
+    own = kept.book.own()
+    assert kept.book.is_open, "it does not close an open service"
+    kept.add("alice")
+    found = kept.book.find(own)
+    assert found is not None and found.role is Role.MAINTAINER and kept.book.own() == own
+    assert KeyBook(kept.path).find(own) is None
+    assert [key.name for key in kept.book.all()] == ["alice"]
 
 
 def test_roles_are_ordered() -> None:

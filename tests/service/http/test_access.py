@@ -131,7 +131,7 @@ def asked(http: httpx2.Client, call: str, headers: dict[str, str]) -> int:
 def socket_status(http: httpx2.Client, headers: dict[str, str]) -> int:
     url = f"{str(http.base_url).replace('http', 'ws').rstrip('/')}/v1/stream"
     with suppress(websockets.exceptions.WebSocketException), connect(url, additional_headers=headers) as socket:
-        if "Authorization" not in headers:
+        if not {"Authorization", "Cookie"} & headers.keys():
             socket.send('{"key": "pw_wrong"}')
         socket.recv(timeout=5.0)
         return 200
@@ -238,6 +238,31 @@ def test_a_browser_logs_in_for_a_cookie_that_only_its_own_page_may_use(http: htt
     assert http.put("/v1/devices/arm", json={"driver": "fake:arm"}, headers=own).status_code == 403
     assert http.delete("/v1/session", headers=own).status_code == 200
     assert http.get("/v1/tasks", headers=cookie).status_code == 401
+
+
+@pytest.mark.parametrize("site", [None, "same-origin", "none", "same-site", "cross-site"])
+def test_a_session_works_for_its_own_page_and_for_no_other(
+    http: httpx2.Client, guarded: Guarded, site: str | None
+) -> None:
+    """The browser table: where a request comes from, by what it asks. Only the page itself may write."""
+    cookie = log_in(http, guarded.keys[Role.OPERATOR])
+    port = guarded.server.port
+    origins = [None, "null", f"http://127.0.0.1:{port}", f"http://localhost:{port}", f"https://127.0.0.1:{port}"]
+    origins += ["http://127.0.0.1:1", f"http://127.0.0.1.evil.example:{port}", "https://evil.example", ""]
+    for origin in origins:
+        headers = {"Cookie": cookie}
+        headers |= {} if origin is None else {"Origin": origin}
+        headers |= {} if site is None else {"Sec-Fetch-Site": site}
+        is_own = origin in origins[2:4] and site in (None, "none", "same-origin")
+        for call in (
+            "POST /v1/lease/heartbeat",
+            "POST /v1/missions",
+            "DELETE /v1/images/{image_id}",
+            "POST /v1/images",
+        ):
+            status = asked(http, call, headers)
+            assert (status not in (401, 403)) == is_own, (call, headers, status)
+        assert (socket_status(http, headers) == 200) == is_own, headers
 
 
 def test_a_wrong_key_does_not_log_in(http: httpx2.Client) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.motion import Compliance, Guard, Hold, MotionReport, Quantity
+from hal.motion import CartesianPath, Compliance, Guard, Hold, MotionReport, Quantity
 from manipulation.planning.cartesian_path import shifted
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.outcome import Outcome, SkillFailure
@@ -26,6 +26,14 @@ SOFT_PUSH = Compliance(
     damping=(500.0, 500.0, 500.0, 10.0, 10.0, 10.0),
     mass=(20.0, 20.0, 20.0, 1.0, 1.0, 1.0),
     max_offset_m=0.015,
+)
+RELAX_S = 0.5
+RELAXING = Compliance(
+    stiffness=(50.0, 50.0, 400.0, INF, INF, 0.5),
+    damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 2.0),
+    mass=(150.0, 150.0, 400.0, 1.0, 1.0, 0.1),
+    max_offset_m=0.012,
+    max_offset_rad=0.5,
 )
 ONSET_N = 1.0  # above noise, drift and inertia in a slow move
 COARSE_RAD = 5e-4  # joint steps of this size or more cause larger inertial forces than a light contact
@@ -92,6 +100,17 @@ def meet(
     force = report.log.wrench[:, :3] @ in_tool
     way, give = (step(depth, force), 0.0) if report.tripped == LIGHT else onset(depth, force, deepest)
     return Meeting(way_m=way, give_n_per_m=give, is_met=report.tripped is not None, report=report)
+
+
+def relax(attempt: Attempt) -> None:
+    """Stay and yield, also about the fingers, until nothing presses on the hand: what presses rubs when it leaves."""
+    here = attempt.pose()
+    attempt.run(
+        CartesianPath(
+            name="relax", flange_from_tool=attempt.context.flange_from_grip, times_s=np.array([0.0, RELAX_S]),
+            base_from_tool=(here, here), compliance=RELAXING,
+        )
+    )  # fmt: skip
 
 
 def _shakes(attempt: Attempt) -> bool:

@@ -13,7 +13,7 @@ from hal.motion import STOPPING_S, Compliance, Guard, MotionReport, Quantity
 from hal.panel import Lever
 from manipulation.planning.cartesian_path import arc, shifted
 from manipulation.skills.attempt import STANDOFF_M, Attempt
-from manipulation.skills.contact import FEEL_M_PER_S, FEEL_N, meet
+from manipulation.skills.contact import FEEL_M_PER_S, FEEL_N, meet, relax
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
@@ -35,8 +35,8 @@ SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
 EASY_N = 35.0  # a bar that gives way below this is turned at once; a heavier one is loaded slowly first
 LOAD_M_PER_S = 0.02  # at 80 mm/s the force overshoots by 30 N before the arm has stopped
-LARGEST_N = 88.0  # below the cell's protective limit, to distinguish a stiff valve from a collision
-LARGEST_WITH_FRICTION_N = 94.0
+LARGEST_N = 84.0  # below the cell's protective limit, to distinguish a stiff valve from a collision
+LARGEST_WITH_FRICTION_N = 92.0
 FELT_RATIO, FELT_N = 1.25, 12.0  # a bar that needs more than this multiple of the felt force plus this much has stalled
 FELT_SAMPLES = 12  # of the log, a tenth of a second
 MOVED_RAD = np.radians(6.0)
@@ -152,6 +152,8 @@ def _turn_lever(attempt: Attempt, valve: Lever, turn: _Turn) -> float:
         failure.reached = turn.start_rad + sign * (failure.reached or 0.0)
         raise
     finally:
+        if np.linalg.norm(attempt.context.mover.state().wrench[:3]) > HEAVY_N:
+            relax(attempt)  # friction on a loaded pad adds to the load at every start of a motion
         back = shifted(attempt.pose(), BACK_M * np.array(way.against))
         attempt.straight(back, name="step back", speed_m_per_s=STROKE_M_PER_S)
         attempt.leave(STANDOFF_M + OVERLAP_M)

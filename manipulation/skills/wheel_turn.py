@@ -8,10 +8,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.motion import CartesianPath, Compliance, Guard, MotionReport, Quantity
+from hal.motion import Compliance, Guard, MotionReport, Quantity
 from hal.panel import Handwheel
 from manipulation.planning.cartesian_path import arc, through
 from manipulation.skills.attempt import Attempt
+from manipulation.skills.contact import relax
 from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.turning import Felt, felt_in
 
@@ -35,11 +36,6 @@ DAMPING = (4000.0, 4000.0, 4000.0, 10.0, 10.0, 10.0)
 MASS = (400.0, 400.0, 400.0, 1.0, 1.0, 1.0)  # with 100 kg friction flips from tick to tick
 MAX_OFFSET_M = 0.008
 LOADING_DAMPING, LOADING_MASS = (1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0), (150.0, 150.0, 400.0, 1.0, 1.0, 1.0)
-RELAX_S = 0.5
-RELAXING = Compliance(
-    stiffness=(50.0, 50.0, 400.0, INF, INF, 0.5), damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 2.0),
-    mass=(150.0, 150.0, 400.0, 1.0, 1.0, 0.1), max_offset_m=0.012, max_offset_rad=0.5,
-)  # fmt: skip
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -115,21 +111,11 @@ class WheelTurn:
             goal_rad = min(felt.end_rad + (left_rad if felt.is_moving else min(left_rad, NEXT_RAD)), limit_rad)
 
     def let_go(self) -> None:
-        """Release the wheel and move back from it."""
+        """Release the wheel, yield until nothing presses on the hand, and move back."""
         if self.open_m is not None:
             self.attempt.open_to(self.open_m, name="let go")
-        self._relax()
+        relax(self.attempt)
         self.attempt.leave(self.up_m)
-
-    def _relax(self) -> None:
-        """Stay and yield, also about the fingers, until nothing presses on the hand: what presses rubs when it leaves."""
-        here = self.attempt.pose()
-        self.attempt.run(
-            CartesianPath(
-                name="relax", flange_from_tool=self.attempt.context.flange_from_grip,
-                times_s=np.array([0.0, RELAX_S]), base_from_tool=(here, here), compliance=RELAXING,
-            )
-        )  # fmt: skip
 
     def _axis(self) -> Array:
         clockwise: Array = self.attempt.context.panel_pose.rotation.apply([0.0, 0.0, -1.0])

@@ -262,6 +262,10 @@ class WorldClient:
         with self._lock:
             return self._link.ask(op, *arguments)
 
+    def lost(self) -> str | None:
+        """Return how the world process was lost, or None; see `WorldLink.lost`."""
+        return self._link.lost()
+
     def close(self) -> None:
         """End the world; a second call does nothing."""
         self._link.close()

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from typing import Any
@@ -18,10 +19,13 @@ from numpy.typing import NDArray
 
 from hal.child_python import module_command
 from hal.errors import DeviceUnavailable
+from hal.process_state import ProcessState, process_state
 from simbackend.wire import DOUBLE, IMAGE_BYTES, REQUEST, SNAPSHOT, Op, WorldConfig, read_exactly
 
 START_S = 180.0  # the first start on a machine compiles the rasteriser; later ones take two seconds
 CLOSE_S = 2.0
+SUSPENDED_S = 1.0  # a world that a debugger holds for longer is given up
+ANSWER_S = 20.0  # the longest answer, a large picture on a busy machine, takes about a second
 
 
 class WorldLink:
@@ -30,6 +34,8 @@ class WorldLink:
     def __init__(self, config: WorldConfig) -> None:
         self._lock = threading.RLock()
         self._is_closed = False
+        self._suspended_since_s: float | None = None
+        self._asked_at_s: float | None = None  # while an answer is awaited
         ours, theirs = socket.socketpair()
         with tempfile.TemporaryFile(prefix="panelwright-images-") as file:
             file.truncate(IMAGE_BYTES)
@@ -81,10 +87,32 @@ class WorldLink:
             info = self.ask(Op.RENDER, *arguments)
             return info, np.frombuffer(self._images, np.float32, int(np.prod(shape))).reshape(shape).copy()
 
+    def lost(self) -> str | None:
+        """Return how the process was lost, as in "the simulated world has ended"; None while it lives or is closed.
+
+        It is lost when it has ended, when it has been suspended for a second, and when it does not answer for 20 s.
+        """
+        now_s, asked_at_s = time.monotonic(), self._asked_at_s
+        if self._is_closed:
+            return None
+        code = self.process.poll()
+        if code is not None:
+            return f"the simulated world has ended (exit code {code})"
+        if asked_at_s is not None and now_s - asked_at_s > ANSWER_S:
+            return f"the simulated world did not answer for {ANSWER_S:.0f} s"
+        if process_state(self.process.pid) is not ProcessState.SUSPENDED:
+            self._suspended_since_s = None
+            return None
+        if self._suspended_since_s is None:
+            self._suspended_since_s = now_s
+        held_s = now_s - self._suspended_since_s
+        return f"the simulated world {ProcessState.SUSPENDED}" if held_s > SUSPENDED_S else None
+
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
         if self._is_closed:
             raise DeviceUnavailable("the simulated world is closed", hint="open the cell again", device="world")
+        self._asked_at_s = time.monotonic()
         try:
             yield
         except (EOFError, OSError) as error:
@@ -93,6 +121,8 @@ class WorldLink:
                 hint="start the cell again; its log says why the world ended",
                 device="world",
             ) from error
+        finally:
+            self._asked_at_s = None
 
     def close(self) -> None:
         """End the process; a second call does nothing."""

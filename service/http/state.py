@@ -24,6 +24,7 @@ from service.tasks.lease import Command
 T = TypeVar("T")
 DEVICE_THREADS = 6
 CONTROL_THREADS = 4
+STOP_THREADS = 2
 MAX_READING = 40
 
 
@@ -37,7 +38,8 @@ class AppState:
         cookie: name of the session's cookie, which differs between services of one machine.
         sessions: the browsers that have logged in.
         pool: threads for device reads; when silent devices fill it, further reads are refused.
-        control_pool: threads for stop, cancel, reset and starting tasks, which no device read may delay.
+        control_pool: threads for cancel, reset and starting tasks, which no device read may delay.
+        stop_pool: threads for nothing but stops, which no reset that waits may delay.
     """
 
     service: Service
@@ -51,6 +53,7 @@ class AppState:
     started_s: float = field(default_factory=time.monotonic)
     pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(DEVICE_THREADS, "device-read"))
     control_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(CONTROL_THREADS, "control"))
+    stop_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(STOP_THREADS, "stop"))
     _reading: int = 0
 
     async def in_thread(self, work: Callable[[], T]) -> T:
@@ -68,7 +71,7 @@ class AppState:
             self._reading -= 1
 
     async def act(self, work: Callable[[], T]) -> T:
-        """Run work that starts, stops, cancels or resets outside the event loop; no device read delays it."""
+        """Run work that starts, cancels or resets outside the event loop; no device read delays it."""
         return await asyncio.get_running_loop().run_in_executor(self.control_pool, _in_this_context(work))
 
     async def commit(self, kind: str, data: dict[str, Any]) -> None:
@@ -78,6 +81,10 @@ class AppState:
             JournalError: it could not be written; the change itself is in effect.
         """
         await self.act(functools.partial(self.service.commit, kind, data))
+
+    async def stop(self, work: Callable[[], T]) -> T:
+        """Run work that stops outside the event loop; only other stops may delay it."""
+        return await asyncio.get_running_loop().run_in_executor(self.stop_pool, _in_this_context(work))
 
 
 def _in_this_context(work: Callable[[], T]) -> Callable[[], T]:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import functools
-import json
 import logging
-import pickle
 import signal
 import sys
 import threading
@@ -29,6 +26,7 @@ from hal.simulated import Fault
 from hal.strict import validate
 from service.errors import DevicesUnavailable
 from service.knowledge.calibrations import Calibrations
+from service.processes.cell_lines import MISSING, CellOrder, error_to_line, note_to_line
 from service.processes.child import Lifeline, kill_own_group
 from service.processes.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
 from service.processes.device_slots import (
@@ -40,28 +38,30 @@ from service.processes.device_slots import (
     failure_of,
     names_another_wire,
 )
-from service.processes.latch import Beat, Latch
+from service.processes.latch import LATCH, Latch
 from service.processes.motion import MotionPort, start_controller
+from service.processes.vigil import Vigil
 from service.recording.endpoint import Endpoint
 
 if TYPE_CHECKING:
     from service.recording.tap import Tap  # only a recorded cell needs the libraries behind it
 
-BEAT_S = 0.05
 CLOSE_TIMEOUT_S = 4.0
-NOTE = "note "  # prefix of a line that goes into the journal
-MISSING = "device-missing"  # kind of the note that says that the cell runs without this device
 SWITCH_S = 0.0005  # interpreter switch interval: the longest that the control thread waits for another thread
 log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class CellRuntime:
-    """A running cell; `objects` maps names to the objects that are served: devices, the mover and the clock."""
+    """A running cell; `objects` maps names to the objects that are served: devices, the mover and the clock.
+
+    `lost` returns why the cell must be started again, for example because its world has ended; None while it can go on.
+    """
 
     cell: Cell
     clock: Clock
     objects: Mapping[str, Any]
+    lost: Callable[[], str | None] = lambda: None
     _closers: list[Callable[[], None]] = field(default_factory=list)
 
     @classmethod
@@ -124,7 +124,7 @@ class CellRuntime:
         except BaseException:
             _close_all(closers)
             raise
-        return cls(cell=cell, clock=clock, objects=objects, _closers=closers)
+        return cls(cell=cell, clock=clock, objects=objects, lost=shared.lost, _closers=closers)
 
     def close(self) -> None:
         """Stop the arm, then close devices, emulators and world even if some of them fail. Idempotent."""
@@ -254,55 +254,6 @@ def _close_all(closers: Iterable[Callable[[], None]]) -> None:
             log.exception("closing the cell")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CellOrder:
-    """The start parameters that the supervisor sends to a new cell process over a private pipe."""
-
-    cell_path: str
-    seed: int | None
-    latch_path: str
-    beat_path: str
-    address: str
-    authkey: str
-    runs_dir: str | None
-    partial: bool
-    swapped: dict[str, dict[str, Any]]
-    record: tuple[str, str] | None = None
-
-    def to_line(self) -> str:
-        """Return the order as one line of JSON."""
-        return json.dumps({name: getattr(self, name) for name in self.__slots__})
-
-    @classmethod
-    def from_line(cls, line: str) -> CellOrder:
-        """Read an order from one line of JSON, the inverse of `to_line`."""
-        return cls(**json.loads(line))
-
-
-def error_to_line(error: CellError) -> str:
-    """Encode an error as one line for the supervisor."""
-    return "error " + base64.b64encode(pickle.dumps(error)).decode()
-
-
-def error_from_line(line: str) -> CellError:
-    """Decode a line of `error_to_line`. It is unpickled, so it must come from our own child process."""
-    error: CellError = pickle.loads(base64.b64decode(line.removeprefix("error ")))  # noqa: S301 - our own child
-    return error
-
-
-def note_to_line(kind: str, data: dict[str, Any]) -> str:
-    """Encode an entry for the journal as one line for the supervisor."""
-    return NOTE + json.dumps([kind, data])
-
-
-def note_from_line(line: str) -> tuple[str, dict[str, Any]] | None:
-    """Decode a line of `note_to_line`; None for any other line."""
-    if not line.startswith(NOTE):
-        return None
-    kind, data = json.loads(line.removeprefix(NOTE))
-    return kind, data
-
-
 def main() -> None:
     """Run the cell process; this is its entry point."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
@@ -310,19 +261,22 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     lifeline = Lifeline()
     order = CellOrder.from_line(lifeline.read_line() or "{}")
-    beat = Beat(Path(order.beat_path))
-    _in_background(lambda: _beat(beat))
-    with Latch(Path(order.latch_path)) as latch:
+    folder = Path(order.folder)
+    vigil = Vigil(folder, lifeline, silence_s=order.silence_s)
+    _in_background(vigil.keep)
+    with Latch(folder / LATCH) as latch:
         is_orphan = threading.Event()
         _in_background(lambda: _end_with_parent(lifeline, is_orphan))
         try:
-            _run(order, lifeline, lambda: is_orphan.is_set() or latch.is_set(), is_orphan)
+            _run(order, lifeline, lambda: is_orphan.is_set() or vigil.is_alone or latch.is_set(), is_orphan, vigil)
         except CellError as error:
             lifeline.write_line(error_to_line(error))
     kill_own_group()
 
 
-def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], end: threading.Event) -> None:
+def _run(
+    order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], end: threading.Event, vigil: Vigil
+) -> None:
     from hal.host import serve
 
     swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
@@ -339,8 +293,10 @@ def _run(order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], e
     )
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     freeze_loaded()
+    vigil.watch(runtime.lost)
     lifeline.write_line("ready")
     end.wait()
+    vigil.watch(lambda: None)  # from now on the world may end
     runtime.close()
     with contextlib.suppress(OSError):
         server.close()
@@ -351,13 +307,6 @@ def _end_with_parent(lifeline: Lifeline, is_orphan: threading.Event) -> None:
     is_orphan.set()  # the control thread reads this at its next tick and stops the arm
     threading.Event().wait(CLOSE_TIMEOUT_S)
     kill_own_group()  # a driver that hangs in `close` must not keep the process alive
-
-
-def _beat(beat: Beat) -> None:
-    pause = threading.Event()
-    while True:
-        beat.beat()
-        pause.wait(BEAT_S)
 
 
 def _in_background(work: Callable[[], None]) -> None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import IO
 
 from hal.child_python import module_command
@@ -27,6 +27,7 @@ class Child:
         module: name of the module, run as by `python -m` without the current folder on the import path.
         arguments: command-line arguments. They must not hold secrets, because other users can read them.
         pass_fds: file descriptors that it inherits.
+        environment: variables in addition to those of this process.
         on_line: called with each line that it prints, from a reader thread.
         on_exit: called once with its exit code, from another thread.
     """
@@ -37,6 +38,7 @@ class Child:
         arguments: Sequence[str] = (),
         *,
         pass_fds: Sequence[int] = (),
+        environment: Mapping[str, str] | None = None,
         on_line: Callable[[str], None],
         on_exit: Callable[[int], None],
     ) -> None:
@@ -47,6 +49,7 @@ class Child:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=tuple(pass_fds),
+            env={**os.environ, **(environment or {})},
             start_new_session=True,
         )
         self._lock = threading.Lock()
@@ -94,13 +97,17 @@ class Child:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE_S)
 
+    def hear_last_words(self) -> None:
+        """Wait a moment until all lines of a child that has ended were delivered."""
+        self._reader.join(LAST_WORDS_S)
+
     def _read(self, on_line: Callable[[str], None]) -> None:
         for line in _opened(self._process.stdout):
             on_line(line.decode("utf-8", "replace").rstrip("\n"))
 
     def _wait(self, on_exit: Callable[[int], None]) -> None:
         code = self._process.wait()
-        self._reader.join(LAST_WORDS_S)  # deliver its last lines before the exit code
+        self.hear_last_words()
         on_exit(code)
 
 

@@ -12,14 +12,15 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
 
+LATCH = "latch"  # name of the file in the runtime folder
 SIZE = 128
 CLEAR = 0x5A  # any other byte, including zero, means latched, so damaged memory cannot release the arm
 LATCHED = 0x01
 WORD = 8  # bytes
 BODY = struct.Struct("<BQd80s")  # flag, count, wall time, source
 BODY_AT = WORD
+RECORDED_AT = 112  # the count of the newest stop that is in the journal; written by the service
 TRIES = 100
 
 
@@ -46,7 +47,9 @@ class Latch:
     def __init__(self, path: Path) -> None:
         with path.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), SIZE)
-        self._sequence = _word(self._memory, "Q")
+        # A view writes the word at once; `struct.pack_into` clears its bytes first, so another process may read a zero.
+        self._sequence = memoryview(self._memory)[:WORD].cast("Q")
+        self._recorded = memoryview(self._memory)[RECORDED_AT : RECORDED_AT + WORD].cast("Q")
         self._writing = threading.RLock()
 
     @classmethod
@@ -97,9 +100,19 @@ class Latch:
             self._write(CLEAR, source)
             return True
 
+    @property
+    def recorded_count(self) -> int:
+        """The count of the newest stop that is in the journal."""
+        return int(self._recorded[0])
+
+    def note_recorded(self, count: int) -> None:
+        """Note that the stop with this count is in the journal."""
+        self._recorded[0] = max(self._recorded[0], count)
+
     def close(self) -> None:
         """Unmap the file; a second call does nothing."""
         self._sequence.release()
+        self._recorded.release()
         self._memory.close()
 
     def _write(self, flag: int, source: str) -> LatchState:
@@ -113,35 +126,3 @@ class Latch:
         BODY.pack_into(self._memory, BODY_AT, flag, count + 1, time.time(), text)
         self._sequence[0] = sequence + 1
         return self.state()
-
-
-class Beat:
-    """A heartbeat in shared memory: one process writes its monotonic time, another reads its age."""
-
-    def __init__(self, path: Path) -> None:
-        if not path.exists():
-            path.write_bytes(b"\0" * WORD)
-        with path.open("r+b") as file:
-            self._memory = mmap.mmap(file.fileno(), WORD)
-        self._at_s = _word(self._memory, "d")
-
-    def beat(self) -> None:
-        """Write the current time."""
-        self._at_s[0] = time.monotonic()
-
-    def age_s(self) -> float:
-        """Return the seconds since the last beat; both processes share the machine's monotonic clock."""
-        return time.monotonic() - float(self._at_s[0])
-
-    def close(self) -> None:
-        """Unmap the file; a second call does nothing."""
-        self._at_s.release()
-        self._memory.close()
-
-
-def _word(memory: mmap.mmap, kind: Literal["Q", "d"]) -> memoryview[Any]:
-    """Return the first eight bytes as one number that is read and written atomically.
-
-    `struct.pack_into` is not suitable: it clears its bytes before it fills them, so another process may read a zero.
-    """
-    return memoryview(memory)[:WORD].cast(kind)

@@ -3,7 +3,8 @@
 This is not a safety function: a machine that can hurt people needs a hardware stop.
 
 Anyone may stop, without a key, a lease or a request body. Only the supervisor can reset, over this process's standard
-input. When the supervisor ends, the process sets the latch and ends.
+input. When the supervisor ends, the process sets the latch and ends. It also sets the latch when the service or the cell
+gives no heartbeat.
 """
 
 from __future__ import annotations
@@ -17,16 +18,27 @@ import signal
 import socket
 import sys
 from pathlib import Path
+from urllib.parse import urlsplit
 
-from service.processes.latch import Latch, LatchState
+from service.processes.beat import PERIOD_S, SILENCE_S, Beat
+from service.processes.latch import LATCH, Latch, LatchState
 
-MAX_HEAD_BYTES = 8192
+MAX_HEAD_BYTES = 65_536  # browsers send the cookies of all pages of this machine, whatever their port
 HEAD_TIMEOUT_S = 2.0
-REASONS = {200: "OK", 204: "No Content", 400: "Bad Request", 404: "Not Found", 405: "Method Not Allowed"}
+RECORD_S = 0.3  # an answer waits no longer for the record of its stop
+MAX_CONNECTIONS = 300  # far fewer than the 1024 files that a process may usually open
+PATH = "/v1/stop"
+REASONS = {
+    200: "OK", 204: "No Content", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed",
+}  # fmt: skip
+LOCAL_NAMES = ("127.0.0.1", "localhost", "::1")
 
 
 class StopServer:
     """Answers `POST /v1/stop` and `GET /v1/stop` in raw HTTP/1.1, one request per connection.
+
+    A request line is enough to stop, whatever follows it. Only the state of the stop is told, and only to callers that used
+    a name of this service: everybody else gets no more than that the stop is latched.
 
     Args:
         latch: the stop latch; only this object writes it.
@@ -36,40 +48,66 @@ class StopServer:
     def __init__(self, latch: Latch, origins: tuple[str, ...] = ()) -> None:
         self._latch = latch
         self._origins = origins
+        self._hosts = {*LOCAL_NAMES, *(urlsplit(origin).hostname or "" for origin in origins)}
+        self._silent: dict[asyncio.StreamWriter, None] = {}  # those that have not sent a request line; the oldest first
 
     async def start(self, listener: socket.socket) -> asyncio.Server:
         """Start to serve on a bound socket."""
         return await asyncio.start_server(self._serve, sock=listener, limit=MAX_HEAD_BYTES, backlog=512)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._silent[writer] = None
+        if len(self._silent) > MAX_CONNECTIONS:
+            next(iter(self._silent)).transport.abort()  # it would keep a later stop from being accepted
         try:
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_TIMEOUT_S)
+            line = await asyncio.wait_for(reader.readuntil(b"\n"), HEAD_TIMEOUT_S)
+            self._silent.pop(writer, None)
             peer = writer.get_extra_info("peername")
-            writer.write(self.answer(head, str(peer[0]) if isinstance(peer, tuple) else "local"))
+            state = self.begin(line, str(peer[0]) if isinstance(peer, tuple) else "local")
+            answer = self.answer(line + await _rest(reader), state, is_recorded=await self._is_recorded(state))
+            writer.write(answer)
             await asyncio.wait_for(writer.drain(), HEAD_TIMEOUT_S)
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # a slow or broken client gets no answer and does not delay others
         finally:
+            self._silent.pop(writer, None)
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
 
-    def answer(self, head: bytes, peer: str) -> bytes:
-        """Return the whole response to a request head; a stop is latched before the rest of the request is checked."""
+    def begin(self, line: bytes, peer: str) -> LatchState | None:
+        """Latch the stop if the request line asks for it; nothing that follows can prevent it."""
+        method, path = _asked(line)
+        return self._latch.set(f"POST {PATH} from {peer}") if (method, path) == ("POST", PATH) else None
+
+    async def _is_recorded(self, state: LatchState | None) -> bool:
+        """Wait a moment until the service has recorded the stop; returns whether it has."""
+        if state is None:
+            return False
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + RECORD_S
+        while self._latch.recorded_count < state.count and loop.time() < end_s:  # noqa: ASYNC110 - in shared memory
+            await asyncio.sleep(0.002)
+        return self._latch.recorded_count >= state.count
+
+    def answer(self, head: bytes, state: LatchState | None, *, is_recorded: bool = False) -> bytes:
+        """Return the whole response to a request head; `state` is that of the stop which it has made."""
         lines = head.decode("latin-1").split("\r\n")
-        method, _, rest = lines[0].partition(" ")
-        path = rest.partition(" ")[0].partition("?")[0].rstrip("/")
+        method, path = _asked(head)
         headers = {key.strip().lower(): value.strip() for key, _, value in (line.partition(":") for line in lines[1:])}
         origin = headers.get("origin", "")
-        if path != "/v1/stop":
-            return self._response(404, {"title": "this port serves only /v1/stop", "hint": "use the main port"}, origin)
-        if method == "POST":
-            state = self._latch.set(f"POST /v1/stop from {peer}")
-            return self._response(200, as_dict(state), origin)
-        if method == "GET":
-            return self._response(200, as_dict(self._latch.state()), origin)
+        is_own = _hostname(headers.get("host", LOCAL_NAMES[0])) in self._hosts and origin in ("", *self._origins)
+        if path != PATH:
+            return self._response(404, {"title": f"this port serves only {PATH}", "hint": "use the main port"}, origin)
+        if state is not None:
+            told = {**as_dict(state), "is_recorded": is_recorded} if is_own else {"is_latched": True}
+            return self._response(200, told, origin)
         if method == "OPTIONS":
             return self._response(204, None, origin)
+        if method == "GET" and is_own:
+            return self._response(200, as_dict(self._latch.state()), origin)
+        if method == "GET":
+            return self._response(403, {"title": "no answer for other hosts and pages", "hint": "POST stops"}, origin)
         return self._response(
             405,
             {"title": f"{method[:16]} is not allowed", "hint": "POST latches the stop, GET returns its state"},
@@ -89,7 +127,32 @@ class StopServer:
         ]
         if origin in self._origins:
             head += [f"Access-Control-Allow-Origin: {origin}", "Access-Control-Allow-Methods: GET, POST"]
+        elif origin and status == 204:  # a page that asks first may stop as well
+            head += ["Access-Control-Allow-Origin: *", "Access-Control-Allow-Methods: POST"]
+            head += ["Access-Control-Allow-Headers: *"]
         return "\r\n".join([*head, "", ""]).encode("latin-1") + data
+
+
+async def _rest(reader: asyncio.StreamReader) -> bytes:
+    """Return the rest of a head; what is too long or too late is left out."""
+    rest, line = b"", b"."
+    with contextlib.suppress(TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+        async with asyncio.timeout(HEAD_TIMEOUT_S):
+            while line.strip() and len(rest) < MAX_HEAD_BYTES:
+                line = await reader.readuntil(b"\n")
+                rest += line
+    return rest
+
+
+def _asked(head: bytes) -> tuple[str, str]:
+    """Return method and path of a request."""
+    method, _, rest = head.partition(b"\n")[0].decode("latin-1").strip().partition(" ")
+    return method, rest.partition(" ")[0].partition("?")[0].rstrip("/")
+
+
+def _hostname(host: str) -> str:
+    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+    return name.strip("[]").lower()
 
 
 def as_dict(state: LatchState) -> dict[str, object]:
@@ -112,8 +175,40 @@ def obey(latch: Latch, line: str) -> None:
         latch.reset(source, seen_count=int(count))
 
 
-async def _run(listener: socket.socket, latch: Latch, origins: tuple[str, ...]) -> None:
+class Watchdog:
+    """Gives the heartbeat of this process and latches the stop when the service or the cell has none.
+
+    Args:
+        folder: runtime folder of the service.
+        silence_s: see `Beat.lost`.
+    """
+
+    def __init__(self, latch: Latch, folder: Path, *, silence_s: float) -> None:
+        self._latch = latch
+        self._own = Beat(folder, "stop")
+        self._others = {name: Beat(folder, name) for name in ("service", "cell")}
+        self._silence_s = silence_s
+
+    def look(self) -> None:
+        """Give one heartbeat and look at those of the others once."""
+        self._own.beat()
+        if self._latch.is_set():
+            return
+        for name, beat in self._others.items():
+            if (why := beat.lost(silence_s=self._silence_s)) is not None:
+                self._latch.set(f"the {name} process {why}")
+
+    async def run(self) -> None:
+        """Look until cancelled."""
+        while True:
+            self.look()
+            await asyncio.sleep(PERIOD_S)
+
+
+async def _run(listener: socket.socket, latch: Latch, origins: tuple[str, ...], watchdog: Watchdog) -> None:
     server = await StopServer(latch, origins).start(listener)
+    watchdog.look()
+    watching = asyncio.create_task(watchdog.run())
     commands = asyncio.StreamReader()
     loop = asyncio.get_running_loop()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
@@ -122,6 +217,7 @@ async def _run(listener: socket.socket, latch: Latch, origins: tuple[str, ...]) 
     while line := await commands.readline():
         obey(latch, line.decode("utf-8", "replace"))
     latch.set("the service is gone")
+    watching.cancel()
     server.close()
 
 
@@ -129,14 +225,16 @@ def main() -> None:
     """Run the stop process; this is its entry point."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--fd", type=int, required=True, help="bound listening socket")
-    parser.add_argument("--latch", type=Path, required=True)
+    parser.add_argument("--folder", type=Path, required=True, help="runtime folder of the service")
+    parser.add_argument("--silence", type=float, default=SILENCE_S, help="see Beat.lost")
     parser.add_argument("--origin", action="append", default=[])
     options = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     with contextlib.suppress(OSError):
         os.nice(-10)  # only root may raise the priority; the process works without it
-    with Latch(options.latch) as latch, socket.socket(fileno=options.fd) as listener:
-        asyncio.run(_run(listener, latch, tuple(options.origin)))
+    with Latch(options.folder / LATCH) as latch, socket.socket(fileno=options.fd) as listener:
+        watchdog = Watchdog(latch, options.folder, silence_s=options.silence)
+        asyncio.run(_run(listener, latch, tuple(options.origin), watchdog))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -36,8 +37,17 @@ class StopHost(Protocol):
         """Process id, or None when it has no process of its own."""
         ...
 
+    @property
+    def restarts(self) -> int:
+        """How often its process was started again."""
+        ...
+
     def is_alive(self) -> bool:
         """Whether the stop port answers requests."""
+        ...
+
+    def look(self) -> None:
+        """Latch the stop when the process was lost; called many times a second."""
         ...
 
     def close(self) -> None:
@@ -66,7 +76,7 @@ class StopDesk:
     """Stops, resets and their records; several threads may call it.
 
     Args:
-        latch: the stop latch, which this object only reads.
+        latch: the stop latch, of which this object writes only what is recorded.
         host: writes the latch.
     """
 
@@ -84,7 +94,7 @@ class StopDesk:
             state = self._host.stop(source)
             self._noted, self._noted_s = state.count, time.monotonic()
         try:
-            self._records.commit("stop", {"source": state.source, "count": state.count})
+            self._record(state)
         except CellError as error:  # the stop holds, with or without a record
             log.error("the stop is latched but not recorded: %s", error.for_people())
         return state
@@ -92,15 +102,25 @@ class StopDesk:
     def note_stop(self) -> None:
         """Record the newest stop once, because the stop port writes the latch without recording.
 
-        Call it periodically; of several stops between two calls only the last one is recorded.
+        Call it periodically; of several stops between two calls only the last one is recorded. It returns when the stop is on
+        disk, for which the stop port waits before it answers.
         """
         with self._noting:
             state = self._latch.state()
             if state.count <= self._noted:
                 return
             self._noted, self._noted_s = state.count, time.monotonic()
-        if state.is_latched:
-            self._records.note("stop", {"source": state.source, "count": state.count})
+        if not state.is_latched:
+            return
+        try:
+            self._record(state)
+        except CellError as error:
+            log.error("the stop is latched but not recorded: %s", error.for_people())
+
+    def _record(self, state: LatchState) -> None:
+        self._records.commit("stop", {"source": state.source, "count": state.count})
+        with contextlib.suppress(ValueError):  # the latch is closed
+            self._latch.note_recorded(state.count)
 
     def reset(self, source: str, *, seen_count: int | None) -> LatchState:
         """Clear the latch; this alone moves nothing.

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hal.errors import ConfigError, MotionRefused
+from service.processes.beat import SILENCE_S, Beat
 from service.processes.child import Child
 from service.processes.latch import Latch, LatchState
 from service.processes.stop import StopServer
@@ -20,7 +21,9 @@ from service.processes.stop import StopServer
 STOP_ANSWER_S = 0.5  # after this, the latch is set from this process
 RESET_ANSWER_S = 5.0  # generous, because a busy machine answers late
 READY_S = 20.0
-MAX_RESTARTS = 3
+LOST_S = 0.5  # a stop process that gives no heartbeat for so long after it was noticed is killed and started again
+PAUSES_S = (0.0, 0.0, 0.5, 1.0, 2.0, 5.0)  # before a restart, by the number of short lives in a row
+SHORT_LIFE_S = 10.0
 log = logging.getLogger(__name__)
 
 
@@ -49,6 +52,14 @@ class InlineStop:
         """Whether its thread is running."""
         return self._thread.is_alive()
 
+    def look(self) -> None:
+        """Do nothing, because there is no other process."""
+
+    @property
+    def restarts(self) -> int:
+        """Zero, because it is not restarted."""
+        return 0
+
     @property
     def pid(self) -> int | None:
         """None, because it has no process of its own."""
@@ -74,26 +85,57 @@ class InlineStop:
 
 
 class ProcessStop:
-    """Runs the stop process and restarts it when it dies; the latch stays set meanwhile, so nothing can move."""
+    """Runs the stop process and restarts it when it dies or hangs; the latch stays set, so nothing can move.
+
+    Args:
+        folder: runtime folder of the service, with the latch and the heartbeats.
+        report: called for each loss of the process.
+        silence_s: see `Beat.lost`.
+    """
 
     def __init__(
         self,
         latch: Latch,
-        latch_path: Path,
+        folder: Path,
         listener: socket.socket | None,
         origins: tuple[str, ...],
         *,
         report: Callable[[str, dict[str, Any]], None],
+        silence_s: float = SILENCE_S,
     ) -> None:
         self._latch = latch
-        self._latch_path = latch_path
+        self._folder = folder
+        self._beat = Beat(folder, "stop")
+        self._silence_s = silence_s
+        self._lost_since_s: float | None = None
+        self._short_lives = 0
         self._listener = listener if listener is not None else _any_port()
         self._origins = origins
         self._report = report
         self._restarts = 0
-        self._is_closing = False
+        self._is_closing = threading.Event()
         self._is_ready = threading.Event()
         self._child = self._begin()
+
+    def lost(self) -> str | None:
+        """Return how the stop process was lost, as in "has ended"; None while it lives or starts."""
+        if not self._child.is_alive():
+            return "has ended"
+        return self._beat.lost(silence_s=self._silence_s) if self._is_ready.is_set() else None
+
+    def look(self) -> None:
+        """Latch the stop when the stop process was lost, and later kill it; called many times a second by one thread."""
+        why, now_s = self.lost(), time.monotonic()
+        if why is None or self._is_closing.is_set():
+            self._lost_since_s = None
+            return
+        if self._lost_since_s is None:
+            self._lost_since_s = now_s
+            self._latch.set(f"the stop process {why}")  # from here, because it cannot
+            log.error("the stop process %s; the stop is latched", why)
+            self._report("stop-process-lost", {"pid": self._child.pid, "why": why})
+        if now_s - self._lost_since_s > LOST_S:
+            self._child.kill()  # `_exited` starts it again
 
     def stop(self, source: str) -> LatchState:
         """Latch the stop through the stop process, or directly when that does not answer."""
@@ -111,20 +153,25 @@ class ProcessStop:
         """
         if self._latch.state().count != seen_count:
             return False
-        self._is_ready.wait(READY_S)
+        self._is_ready.wait(RESET_ANSWER_S)
         is_told = self._child.write_line(f"reset {seen_count} {_line(source)}")
         if not (is_told and self._has_changed(seen_count, RESET_ANSWER_S)):
             self._latch.set("a reset without an answer")  # raises the count, so that a late reset is refused
             raise MotionRefused(
-                f"the stop process did not answer within {RESET_ANSWER_S:.0f} s, so the stop stays latched",
+                "the stop process did not answer, so the stop stays latched",
                 hint="look at the cell, then reset again; is the machine overloaded?",
             )
         now = self._latch.state()
         return not now.is_latched and now.count == seen_count + 1
 
     def is_alive(self) -> bool:
-        """Whether the process is running."""
-        return self._child.is_alive()
+        """Whether the process is running and gives its heartbeat."""
+        return self.lost() is None
+
+    @property
+    def restarts(self) -> int:
+        """How often the process was started again."""
+        return self._restarts
 
     @property
     def pid(self) -> int | None:
@@ -133,12 +180,13 @@ class ProcessStop:
 
     def close(self) -> None:
         """End the process; it latches the stop before it ends."""
-        self._is_closing = True
+        self._is_closing.set()
         self._child.end(grace_s=1.0)
         self._listener.close()
 
     def _begin(self) -> Child:
-        arguments = ["--fd", str(self._listener.fileno()), "--latch", str(self._latch_path)]
+        arguments = ["--fd", str(self._listener.fileno()), "--folder", str(self._folder)]
+        arguments += ["--silence", str(self._silence_s)]
         for origin in self._origins:
             arguments += ["--origin", origin]
         return Child(
@@ -150,15 +198,20 @@ class ProcessStop:
         )
 
     def _exited(self, code: int) -> None:
-        if self._is_closing:
+        """Latch the stop and start the process again; called once for each process that ended."""
+        if self._is_closing.is_set():
             return
         self._is_ready.clear()
         self._latch.set("the stop process died")
         log.error("the stop process died with code %d; the stop is latched", code)
         self._report("stop-process-down", {"code": code})
-        if self._restarts < MAX_RESTARTS:
+        is_short = time.monotonic() - self._child.started_s < SHORT_LIFE_S
+        self._short_lives = min(self._short_lives + 1, len(PAUSES_S) - 1) if is_short else 0
+        if not self._is_closing.wait(PAUSES_S[self._short_lives]):
             self._restarts += 1
             self._child = self._begin()
+        if self._is_closing.is_set():
+            self._child.end(grace_s=0.0)
 
     def _has_changed(self, count: int, within_s: float) -> bool:
         end_s = time.monotonic() + within_s
@@ -166,6 +219,8 @@ class ProcessStop:
         while time.monotonic() < end_s:
             if self._latch.state().count != count:
                 return True
+            if self.lost() is not None:
+                return False
             pause.wait(0.0005)
         return False
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import secrets
 import shutil
 import socket
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -17,18 +15,21 @@ from typing import Any
 
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
-from service.processes.cell import MISSING, CellOrder, CellRuntime, error_from_line, note_from_line
+from service.processes.beat import SILENCE_S, Beat, every_beat
+from service.processes.cell import CellRuntime
+from service.processes.cell_lines import LOST, MISSING, CellOrder, error_from_line, note_from_line
 from service.processes.child import Child
 from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
-from service.processes.latch import Beat, Latch, LatchState
+from service.processes.latch import LATCH, Latch, LatchState
+from service.processes.runtime_folder import RuntimeFolder
 from service.processes.stop_desk import Records, StopDesk, StopHost
 from service.processes.stop_host import InlineStop, ProcessStop
 from service.recording.endpoint import Endpoint
 
 START_TIMEOUT_S = 400.0  # the first start compiles the control kernels, which takes minutes on a busy machine
-MAX_RESTARTS = 3
-BEAT_TIMEOUT_S = 10.0  # numba's compiler can hold the interpreter lock for seconds, which delays the beat thread
-WATCH_S = 0.1
+MAX_SHORT_LIVES = 3  # a cell that ends this often within SHORT_LIFE_S of its start stays down when it ends again
+SHORT_LIFE_S = 10.0
+GIVE_UP_S = 2.5  # a cell that was lost and has not ended is killed after this time
 NO_RECORDS = Records()
 log = logging.getLogger(__name__)
 
@@ -89,24 +90,32 @@ class Supervisor:
         self._partial = partial
         self._report = records.note
         self._missing: dict[str, MissingDevice] = {}
-        self._folder = Path(tempfile.mkdtemp(prefix="panelwright-"))
-        self.latch = Latch.create(self._folder / "latch")
-        self._beat = Beat(self._folder / "beat")
+        self._runtime = RuntimeFolder()
+        self.latch = Latch.create(self.folder / LATCH)
+        self._own_beat, self._cell_beat = Beat(self.folder, "service"), Beat(self.folder, "cell")
+        self._own_beat.beat()
         self._stop: StopHost = (
             InlineStop(self.latch, stop_listener, origins)
             if inline
-            else ProcessStop(self.latch, self._folder / "latch", stop_listener, origins, report=records.note)
+            else ProcessStop(self.latch, self.folder, stop_listener, origins, report=records.note)
         )
         self._remote = RemoteConnection(cell)
         self._local: LocalConnection | None = None
         self._child: Child | None = None
         self._restarts = 0
+        self._short_lives = 0
+        self._lost_since_s: float | None = None
+        self._how_lost = self._why_lost = ""
+        self._ready_at_s = time.monotonic()
+        self._is_watched = False
+        self._must_bury = threading.Event()
         self._swapped: dict[str, DeviceSection] = {}
         self._problem: CellError | None = None
         self._is_ready = threading.Event()
         self._is_closing = threading.Event()
         self._lock = threading.RLock()
         self._desk = StopDesk(self.latch, self._stop, records)
+        self._watching = threading.Event() if inline else every_beat(self._look, name="heartbeat")
 
     @property
     def connection(self) -> CellConnection:
@@ -116,7 +125,12 @@ class Supervisor:
     @property
     def folder(self) -> Path:
         """Runtime folder with latch, heartbeat and sockets; only this user has access."""
-        return self._folder
+        return self._runtime.path
+
+    @property
+    def _temporary(self) -> Path:
+        """Folder for the temporary files of the cell process."""
+        return self.folder / "cell"
 
     @property
     def is_ready(self) -> bool:
@@ -148,6 +162,7 @@ class Supervisor:
         if self.cell.file.cell.mode == "sim" and self.latch.state().count == begun:  # nobody stopped it meanwhile
             self.reset("supervisor: a simulated cell starts ready", seen_count=begun)
         if not self.inline:
+            self._is_watched = True
             threading.Thread(target=self._watch, name="watch-cell", daemon=True).start()
 
     def stop(self, source: str) -> LatchState:
@@ -181,7 +196,9 @@ class Supervisor:
                 restarts=self._restarts,
                 detail=detail,
             ),
-            ProcessHealth(name="stop", pid=self._stop.pid, is_alive=self._stop.is_alive(), restarts=0),
+            ProcessHealth(
+                name="stop", pid=self._stop.pid, is_alive=self._stop.is_alive(), restarts=self._stop.restarts
+            ),
         )
 
     def close(self) -> None:
@@ -189,6 +206,7 @@ class Supervisor:
         if self._is_closing.is_set():
             return
         self._is_closing.set()
+        self._must_bury.set()  # wakes the thread that waits for it
         self._stop.stop("the service ends")
         self._is_ready.clear()
         if self._local is not None:
@@ -198,9 +216,10 @@ class Supervisor:
         if child is not None:
             child.end()
         self._remote.close()
+        self._watching.set()
         self._stop.close()
         self.latch.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._runtime.close()
 
     def _start_inline(self) -> None:
         runtime = self._replay() if self._replay is not None else self._start_runtime()
@@ -239,6 +258,7 @@ class Supervisor:
             answered.set()
 
         self._missing.clear()
+        self._why_lost = ""
         order = self._order()
         child = self._begin_child(on_line, on_exit)
         child.write_line(order.to_line())
@@ -256,6 +276,7 @@ class Supervisor:
         clock = connect(order.address, bytes.fromhex(order.authkey), "cell.clock")
         self._remote.attach(lambda name: connect(order.address, bytes.fromhex(order.authkey), name, clock=clock))
         self._problem = None
+        self._ready_at_s = time.monotonic()
         self._is_ready.set()
         self._report("cell-ready", {"pid": child.pid, "seconds": round(time.monotonic() - child.started_s, 3)})
 
@@ -263,6 +284,8 @@ class Supervisor:
         """Handle a note that the cell process sends."""
         if kind == MISSING:
             self._missing[data["device"]] = MissingDevice(**data)
+        if kind == LOST:
+            self._why_lost = data["why"]
         self._report(kind, data)
 
     def _order(self) -> CellOrder:
@@ -270,9 +293,8 @@ class Supervisor:
         return CellOrder(
             cell_path=str(self.cell.path),
             seed=self.cell.file.cell.seed,
-            latch_path=str(self._folder / "latch"),
-            beat_path=str(self._folder / "beat"),
-            address=str(self._folder / f"cell-{secrets.token_hex(4)}.sock"),
+            folder=str(self.folder),
+            address=str(self.folder / f"cell-{secrets.token_hex(4)}.sock"),
             authkey=secrets.token_hex(32),
             runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
             partial=self._partial,
@@ -284,43 +306,76 @@ class Supervisor:
         with self._lock:
             if self._is_closing.is_set():
                 raise DeviceUnavailable("the service is ending", hint="start it again", device="cell")
-            self._child = Child("service.processes.cell", on_line=on_line, on_exit=on_exit)
+            self._temporary.mkdir(exist_ok=True)
+            own = {"TMPDIR": str(self._temporary)}  # so that nothing remains of a cell that is killed
+            self._child = Child("service.processes.cell", environment=own, on_line=on_line, on_exit=on_exit)
             return self._child
 
+    def _look(self) -> None:
+        """Give the heartbeat of the service, and look at those of the stop process and the cell; 50 times a second."""
+        self._own_beat.beat()
+        self._stop.look()
+        child, now_s = self._child, time.monotonic()
+        if not self._is_watched or child is None or self._is_closing.is_set():
+            return
+        why = self._cell_beat.lost(silence_s=SILENCE_S) if child.is_alive() else "has ended"
+        if why is None:
+            self._lost_since_s = None
+            return
+        if self._lost_since_s is None:
+            self._lost_since_s = now_s
+            self._is_ready.clear()
+            self._how_lost = why
+            self._stop.stop(f"the cell process {why}")
+        if not child.is_alive() or now_s - self._lost_since_s > GIVE_UP_S:
+            self._is_watched = False  # until it is started again
+            self._must_bury.set()
+
     def _watch(self) -> None:
-        """Watch the cell process until the end; when it dies or hangs, latch the stop, clean up and restart it."""
-        while not self._is_closing.wait(WATCH_S):
+        """Clean up after each cell process that was lost and start it again, until the end."""
+        while True:
+            self._must_bury.wait()
+            self._must_bury.clear()
             child = self._child
-            assert child is not None  # noqa: S101 - narrowing: the watch begins after the start
-            if child.is_alive() and self._beat.age_s() < BEAT_TIMEOUT_S:
-                continue
-            self._bury(child)
-            if self._restarts >= MAX_RESTARTS:
-                log.error("the cell died %d times and is not restarted", self._restarts + 1)
+            if self._is_closing.is_set() or child is None:
                 return
+            self._bury(child)
+            is_short = time.monotonic() - self._ready_at_s < SHORT_LIFE_S
+            self._short_lives = self._short_lives + 1 if is_short else 0
+            if not self._comes_back():
+                return
+
+    def _comes_back(self) -> bool:
+        """Start the cell, again when that fails; returns False when it stays down."""
+        while not self._is_closing.is_set():
+            if self._short_lives > MAX_SHORT_LIVES:
+                log.error(
+                    "the cell died %d times in a row soon after its start and is not restarted", self._short_lives
+                )
+                return False
             self._restarts += 1
-            with contextlib.suppress(CellError):
-                self._revive()
+            try:
+                self._start_child()
+            except CellError as error:
+                self._problem = error
+                self._short_lives += 1
+                log.error("the cell did not restart: %s", error.for_people())
+                self._report("cell-restart-failed", {"why": error.what})
+            else:
+                self._lost_since_s, self._is_watched = None, True
+                return True
+        return False
 
     def _bury(self, child: Child) -> None:
-        why = "died" if not child.is_alive() else f"hung: no sign of life for {self._beat.age_s():.1f} s"
-        self._is_ready.clear()
-        self._stop.stop(f"the cell process {why}")
         child.kill()  # also ends the process of its simulated world
+        child.hear_last_words()
+        why = self._why_lost or f"the cell process {self._how_lost}"
         self._remote.detach()
         self._problem = DeviceUnavailable(
-            f"the cell process {why}",
-            hint="it is restarted up to three times; the stop stays latched until a reset",
+            f"{why}; the cell is started again",
+            hint="wait until GET /readyz says that it is ready; the stop stays latched until a reset",
             device="cell",
         )
-        log.error("the cell process (pid %d) %s", child.pid, why)
+        log.error("the cell process (pid %d) is lost: %s", child.pid, why)
         self._report("cell-down", {"pid": child.pid, "why": why})
-
-    def _revive(self) -> None:
-        try:
-            self._start_child()
-        except CellError as error:
-            self._problem = error
-            log.error("the cell did not restart: %s", error.for_people())
-            self._report("cell-restart-failed", {"why": error.what})
-            raise
+        shutil.rmtree(self._temporary, ignore_errors=True)

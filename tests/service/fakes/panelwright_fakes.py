@@ -65,6 +65,8 @@ class FakeDevice:
         self._thawed = threading.Event()
         self._closed = False
         self._child = self._world(options["child_pid_file"]) if "child_pid_file" in options else None
+        if self._child is not None:
+            context.shared.get(f"world of {self.name}", lambda: self)
 
     @staticmethod
     def _world(pid_file: str) -> subprocess.Popen[bytes]:
@@ -86,6 +88,10 @@ class FakeDevice:
         if self._child is not None:
             self._child.kill()
             self._child.wait()
+
+    def lost(self) -> str | None:
+        ended = not self._closed and self._child is not None and self._child.poll() is not None
+        return "the fake world has ended" if ended else None
 
     def inject_fault(self, fault: Fault | None, *, magnitude: float = 0.0) -> None:
         self._fault = fault

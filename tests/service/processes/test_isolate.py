@@ -16,7 +16,8 @@ from hal.config import Cell, load_cell
 from hal.errors import ConfigError, DeviceUnavailable
 from hal.isolated import IsolatedDevice
 from hal.registry import Context
-from service.processes.cell import CellRuntime, note_from_line, note_to_line
+from service.processes.cell import CellRuntime
+from service.processes.cell_lines import note_from_line, note_to_line
 from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
 from tests.service.conftest import WriteCell

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
-import subprocess
-import sys
+import socket
 import threading
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from service.processes.latch import BODY_AT, CLEAR, SIZE, Beat, Latch
+from service.processes.latch import BODY_AT, CLEAR, SIZE, Latch
 from service.processes.stop import StopServer, obey
 
 
@@ -146,30 +146,12 @@ class LatchLife(RuleBasedStateMachine):
 TestLatchLife = LatchLife.TestCase
 
 
-def test_a_beat_grows_old(tmp_path: Path) -> None:
-    beat = Beat(tmp_path / "beat")
-    assert beat.age_s() > 1.0, "never beaten"
-    beat.beat()
-    assert beat.age_s() < 1.0
-
-
-def test_no_reader_in_another_process_ever_sees_half_a_beat(tmp_path: Path) -> None:
-    beat = Beat(tmp_path / "beat")
-    beat.beat()
-    writer = (
-        "import sys, pathlib; from service.processes.latch import Beat\n"
-        "b = Beat(pathlib.Path(sys.argv[1]))\nwhile True: b.beat()"
-    )
-    with subprocess.Popen([sys.executable, "-c", writer, str(tmp_path / "beat")]) as process:
-        oldest_s = max(beat.age_s() for _ in range(2_000_000))
-        process.kill()
-    assert oldest_s < 600.0, "a torn number looks hours old"
-
-
 def _answer(tmp_path: Path, request: str, origins: tuple[str, ...] = ()) -> tuple[int, dict[str, object], str, Latch]:
     latch = Latch.create(tmp_path / "latch")
     latch.reset("test", seen_count=latch.state().count)
-    text = StopServer(latch, origins).answer(request.encode(), "127.0.0.1").decode()
+    server, head_bytes = StopServer(latch, origins), request.encode("latin-1")
+    state = server.begin(head_bytes.partition(b"\n")[0], "127.0.0.1")
+    text = server.answer(head_bytes, state).decode()
     head, _, body = text.partition("\r\n\r\n")
     return int(head.split()[1]), json.loads(body or "{}"), head, latch
 
@@ -208,8 +190,6 @@ def test_the_supervisors_lines_stop_and_reset(tmp_path: Path) -> None:
 
 def test_slow_and_broken_clients_hold_nobody_up(tmp_path: Path) -> None:
     """A stop is still answered with hundreds of half-open connections."""
-    import socket
-
     latch = Latch.create(tmp_path / "latch")
 
     async def scene() -> bytes:
@@ -230,3 +210,92 @@ def test_slow_and_broken_clients_hold_nobody_up(tmp_path: Path) -> None:
 
     assert asyncio.run(scene()).startswith(b"HTTP/1.1 200")
     assert "POST /v1/stop" in latch.state().source
+
+
+def test_a_strange_host_or_page_may_stop_and_is_told_nothing_else(tmp_path: Path) -> None:
+    own = ("http://127.0.0.1:8460",)
+    for stranger in ("Host: evil.example", "Host: 127.0.0.1:8461\r\nOrigin: http://127.0.0.1:3000"):
+        status, body, _, latch = _answer(tmp_path, f"POST /v1/stop HTTP/1.1\r\n{stranger}\r\n\r\n", own)
+        assert (status, body, latch.is_set()) == (200, {"is_latched": True}, True)
+        status, body, head, _ = _answer(tmp_path, f"GET /v1/stop HTTP/1.1\r\n{stranger}\r\n\r\n", own)
+        assert (status, "Access-Control" in head) == (403, False)
+        assert "source" not in body and "is_latched" not in body
+    status, body, head, _ = _answer(tmp_path, f"GET /v1/stop HTTP/1.1\r\nOrigin: {own[0]}\r\n\r\n", own)
+    assert (status, "count" in body) == (200, True)
+
+
+def test_a_page_of_any_origin_that_asks_first_may_stop(tmp_path: Path) -> None:
+    request = "OPTIONS /v1/stop HTTP/1.1\r\nOrigin: http://evil\r\nAccess-Control-Request-Headers: x\r\n\r\n"
+    status, _, head, latch = _answer(tmp_path, request)
+    assert (status, latch.is_set()) == (204, False)
+    assert "Access-Control-Allow-Methods: POST\r\n" in head
+
+
+async def _talk(latch: Latch, *parts: bytes, is_complete: bool) -> bytes:
+    """Send parts to a stop server; return its answer, or nothing when the stop is latched and none is awaited."""
+    listener = socket.socket()
+    listener.bind(("127.0.0.1", 0))
+    server = await StopServer(latch).start(listener)
+    reader, writer = await asyncio.open_connection("127.0.0.1", listener.getsockname()[1])
+    for part in parts:
+        writer.write(part)
+        await writer.drain()
+    answer = b""
+    if is_complete:
+        answer = await reader.read()
+    else:
+        pause = asyncio.Event()
+        while not latch.is_set():
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(pause.wait(), 0.005)
+    writer.close()
+    server.close()
+    return answer
+
+
+def test_a_stop_with_60_kb_of_cookies_stops_and_is_answered(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    latch.reset("test", seen_count=latch.state().count)
+    cookies = b"".join(b"Cookie: " + b"x" * 3000 + b"\r\n" for _ in range(20))
+    request = b"POST /v1/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n" + cookies + b"\r\n"
+    answer = asyncio.run(_talk(latch, request, is_complete=True))
+    assert answer.startswith(b"HTTP/1.1 200") and latch.is_set()
+
+
+def test_a_request_line_stops_although_the_rest_of_its_head_never_comes(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    latch.reset("test", seen_count=latch.state().count)
+    asyncio.run(asyncio.wait_for(_talk(latch, b"POST /v1/stop HTTP/1.1\r\nHost: 12", is_complete=False), 30.0))
+    assert latch.is_set()
+
+
+def test_the_answer_to_a_stop_says_whether_it_is_recorded(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    request = b"POST /v1/stop HTTP/1.1\r\n\r\n"
+    assert b'"is_recorded": false' in asyncio.run(_talk(latch, request, is_complete=True)), "nobody records it here"
+    latch.note_recorded(latch.state().count + 1)
+    assert b'"is_recorded": true' in asyncio.run(_talk(latch, request, is_complete=True))
+
+
+def test_a_thousand_silent_connections_do_not_keep_a_stop_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest silent connection is closed for each new one, so that files do not run out."""
+    monkeypatch.setattr("service.processes.stop.MAX_CONNECTIONS", 20)
+    latch = Latch.create(tmp_path / "latch")
+
+    async def scene() -> bytes:
+        listener = socket.socket()
+        listener.bind(("127.0.0.1", 0))
+        server = await StopServer(latch).start(listener)
+        port = listener.getsockname()[1]
+        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(40)]
+        closed = await asyncio.wait_for(silent[0][0].read(), 30.0)
+        assert closed == b"", "the first was closed before its time"
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"POST /v1/stop HTTP/1.1\r\n\r\n")
+        answer = await reader.read()
+        for _, each in [*silent, (reader, writer)]:
+            each.close()
+        server.close()
+        return answer
+
+    assert asyncio.run(scene()).startswith(b"HTTP/1.1 200")

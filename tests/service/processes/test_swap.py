@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -31,6 +32,7 @@ from tests.service.waiting import eventually
 
 SENSOR = "/v1/devices/finger_proximity"
 CAMERA = "/v1/devices/wrist_camera"
+WIRES = '[safety]\nallowed_places = ["/dev/pts/*", "/*/panelwright-*"]'  # where the emulators of the tests are
 SOON = Deadline.after(WallClock(), 3600.0)
 
 
@@ -38,7 +40,7 @@ SOON = Deadline.after(WallClock(), 3600.0)
 def sensors(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
     """Yield a service with sensors in a separate cell process."""
     options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), warm=False)
-    panelwright = Panelwright(load_cell(write_module_cell(mode="real")), options, operations=OPERATIONS)
+    panelwright = Panelwright(load_cell(write_module_cell(mode="real", extra=WIRES)), options, operations=OPERATIONS)
     panelwright.start()
     yield panelwright
     panelwright.close()
@@ -81,6 +83,37 @@ def test_a_wired_device_takes_the_place_of_another_and_gives_it_back(http: httpx
     assert http.post(f"{SENSOR}/fault", json={"fault": "silent"}).status_code == 409, "it is real now"
     assert http.put(SENSOR, json={"driver": "fake:proximity"}).status_code == 200
     assert value(http) == 0.123
+
+
+@pytest.mark.parametrize("driver", ["serial:tfmini", "modbus:lights", "somebody:elses"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"port": "/etc/passwd"},
+        {"port": "/dev/pts/../../etc/passwd"},
+        {"port": "spy:///dev/pts/0?file=/etc/shadow"},
+        {"host": "192.0.2.7"},
+        {"host": "127.0.0.1", "port": 22},
+        {"line": {"url": "tcp://192.0.2.7:80"}},
+        {"secrets": "/etc/passwd"},
+    ],
+)
+def test_no_client_leads_a_device_to_a_place_that_the_cell_file_does_not_allow(
+    http: httpx2.Client, driver: str, options: dict[str, Any]
+) -> None:
+    answer = http.put(SENSOR, json={"driver": driver, "options": options})
+    assert (answer.status_code, "safety.allowed_places" in answer.text) == (422, True), answer.text
+    assert value(http) == 0.123
+
+
+def test_a_strangers_port_is_not_connected_to(http: httpx2.Client) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as stranger:
+        options = {"host": "127.0.0.1", "port": stranger.getsockname()[1]}
+        for driver in ("udp:netft", "modbus:lights", "ur:rtde"):
+            assert http.put("/v1/devices/panel_lights", json={"driver": driver, "options": options}).status_code == 422
+        stranger.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stranger.accept()
 
 
 def test_the_other_devices_go_on_meanwhile(http: httpx2.Client, far_side: Any) -> None:
@@ -248,7 +281,9 @@ def test_the_swapped_device_is_there_again_after_a_restart_of_the_cell_process(
 def robot(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panelwright]:
     """Yield an inline cell with an arm."""
     options = Options(port=0, runs_dir=tmp_path_factory.mktemp("runs"), inline=True, warm=False)
-    panelwright = Panelwright(load_cell(write_module_cell(robot=True, mode="real")), options, operations=OPERATIONS)
+    panelwright = Panelwright(
+        load_cell(write_module_cell(robot=True, mode="real", extra=WIRES)), options, operations=OPERATIONS
+    )
     panelwright.start()
     supervisor = panelwright.service.supervisor
     supervisor.reset("test", seen_count=supervisor.latch.state().count)

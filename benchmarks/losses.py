@@ -1,0 +1,126 @@
+"""Kills and suspends the processes of a cell: `python -m benchmarks.losses [--times 20] [--cell FILE]`.
+
+Measures the time from the signal to the latched stop, which the control thread reads at its next tick, and the time until
+the cell is ready again. Prints a table and the pass line: each loss is noticed within 120 ms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hal.config import load_cell
+from service.processes.latch import LATCH, Latch
+from service.processes.supervisor import Supervisor
+
+ROOT = Path(__file__).resolve().parents[1]
+PASS_S = 0.12
+LONGEST_S = 60.0
+SIGNALS = {"killed": signal.SIGKILL, "suspended": signal.SIGSTOP}
+SERVICE = """
+import sys, threading
+from pathlib import Path
+from hal.config import load_cell
+from service.processes.supervisor import Supervisor
+supervisor = Supervisor(load_cell(Path(sys.argv[1])))
+supervisor.start()
+print(supervisor.folder, flush=True)
+threading.Event().wait()
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loss:
+    """How long it took until the stop was latched, and until the cell was ready again (zero for a lost service)."""
+
+    noticed_s: float
+    ready_s: float
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print; return 1 if the pass line is missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--times", type=int, default=20)
+    parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
+    given = parser.parse_args(arguments)
+    print("| lost | how | times | noticed ms, median | p99 | longest | ready again s, median | longest |")
+    print(f"|{' --- |' * 8}", flush=True)
+    latest_s = 0.0
+    for name in ("cell", "stop", "service"):
+        for how, number in SIGNALS.items():
+            losses = [one(name, number, given.cell) for _ in range(given.times)]
+            noticed = np.array([loss.noticed_s for loss in losses])
+            ready = [loss.ready_s for loss in losses]
+            latest_s = max(latest_s, float(np.quantile(noticed, 0.99)))
+            print(
+                f"| {name} | {how} | {len(losses)} | {1e3 * np.median(noticed):.0f} | {1e3 * np.quantile(noticed, 0.99):.0f} "
+                f"| {1e3 * noticed.max():.0f} | {np.median(ready):.1f} | {max(ready):.1f} |",
+                flush=True,
+            )
+    print(f"noticed: p99 {1e3 * latest_s:.0f} ms in the worst line (pass: {1e3 * PASS_S:.0f} ms)")
+    return int(latest_s > PASS_S)
+
+
+def one(name: str, number: signal.Signals, cell: Path) -> Loss:
+    """Lose a process once."""
+    if name == "service":
+        return _service(number, cell)
+    supervisor = Supervisor(load_cell(cell))
+    try:
+        supervisor.start()
+        pid = next(process.pid for process in supervisor.processes() if process.name == name)
+        assert pid is not None
+        begun_s = time.monotonic()
+        os.kill(pid, number)
+        noticed_s = _until(supervisor.latch.is_set) - begun_s
+
+        def is_back() -> bool:
+            health = next(process for process in supervisor.processes() if process.name == name)
+            return health.pid != pid and health.is_alive and supervisor.is_ready
+
+        return Loss(noticed_s=noticed_s, ready_s=_until(is_back) - begun_s)
+    finally:
+        supervisor.close()
+
+
+def _service(number: signal.Signals, cell: Path) -> Loss:
+    with _served(cell) as (process, folder), Latch(folder / LATCH) as latch:
+        begun_s = time.monotonic()
+        os.kill(process.pid, number)
+        return Loss(noticed_s=_until(latch.is_set) - begun_s, ready_s=0.0)
+
+
+@contextmanager
+def _served(cell: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
+    command = [sys.executable, "-P", "-c", SERVICE, str(cell)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process, Path(process.stdout.readline().strip())
+        finally:
+            process.kill()
+
+
+def _until(is_true: Callable[[], bool]) -> float:
+    """Return the monotonic time at which a condition became true."""
+    pause, end_s = threading.Event(), time.monotonic() + LONGEST_S
+    while not is_true():
+        if time.monotonic() > end_s:
+            raise TimeoutError(f"not true after {LONGEST_S:.0f} s")
+        pause.wait(0.0005)
+    return time.monotonic()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,45 @@
+"""Gives the heartbeat of the cell process and watches what the cell cannot run without."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from service.processes.beat import PERIOD_S, Beat
+from service.processes.cell_lines import LOST, note_to_line
+from service.processes.child import Lifeline, kill_own_group
+
+
+class Vigil:
+    """Gives the heartbeat of the cell and watches what the cell cannot run without.
+
+    Without a stop process nobody can stop the arm, so `is_alone` counts as a stop. Without its world the cell has no
+    devices: it tells the supervisor and ends, so that both are started again.
+    """
+
+    def __init__(self, folder: Path, lifeline: Lifeline, *, silence_s: float) -> None:
+        self._lifeline = lifeline
+        self._own, self._stop = Beat(folder, "cell"), Beat(folder, "stop")
+        self._silence_s = silence_s
+        self._lost: Callable[[], str | None] = lambda: None
+        self.is_alone = False
+
+    def watch(self, lost: Callable[[], str | None]) -> None:
+        """Also watch what `lost` looks at; it returns the reason for which the cell must end, or None."""
+        self._lost = lost
+
+    def keep(self) -> None:
+        """Give heartbeats and watch, endlessly."""
+        pause = threading.Event()
+        while True:
+            self.look()
+            pause.wait(PERIOD_S)
+
+    def look(self) -> None:
+        """Give one heartbeat and look once."""
+        self._own.beat()
+        self.is_alone = self._stop.lost(silence_s=self._silence_s) is not None
+        if (why := self._lost()) is not None:
+            self._lifeline.write_line(note_to_line(LOST, {"why": why}))
+            kill_own_group()

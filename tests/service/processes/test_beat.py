@@ -1,0 +1,90 @@
+"""A process that ends, is suspended or falls silent is noticed by its heartbeat."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hal.process_state import ProcessState, process_state
+from service.processes.beat import LOOK_S, Beat
+from service.processes.latch import Latch
+from service.processes.stop import Watchdog
+from tests.service.waiting import eventually
+
+BEATS = (
+    "import sys, pathlib; from service.processes.beat import Beat\n"
+    "b = Beat(pathlib.Path(sys.argv[1]), 'cell')\nwhile True: b.beat()"
+)
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Iterator[tuple[Beat, int]]:
+    """Yield the heartbeat and the id of another process that gives it all the time."""
+    beat = Beat(tmp_path, "cell")
+    with subprocess.Popen([sys.executable, "-c", BEATS, str(tmp_path)]) as process:
+        eventually(lambda: beat.age_s() < LOOK_S)
+        yield beat, process.pid
+        process.kill()
+
+
+def test_nothing_is_lost_before_its_first_heartbeat(tmp_path: Path) -> None:
+    beat = Beat(tmp_path, "cell")
+    assert beat.age_s() > 1.0
+    assert beat.lost(silence_s=0.0) is None
+    beat.beat()
+    assert beat.age_s() < 1.0
+
+
+def test_a_suspended_process_is_lost_until_it_goes_on(other: tuple[Beat, int]) -> None:
+    beat, pid = other
+    assert beat.lost(silence_s=600.0) is None
+    os.kill(pid, signal.SIGSTOP)
+    assert eventually(lambda: beat.lost(silence_s=600.0)) == ProcessState.SUSPENDED
+    os.kill(pid, signal.SIGCONT)
+    eventually(lambda: beat.lost(silence_s=600.0) is None)
+
+
+def test_a_killed_process_is_lost_although_its_parent_has_not_asked_for_it(other: tuple[Beat, int]) -> None:
+    beat, pid = other
+    os.kill(pid, signal.SIGKILL)
+    assert eventually(lambda: beat.lost(silence_s=600.0)) == ProcessState.ENDED
+
+
+def test_a_process_that_runs_and_is_silent_is_lost_after_its_time(tmp_path: Path) -> None:
+    beat = Beat(tmp_path, "cell")
+    beat.beat()
+    assert "no sign of life" in str(eventually(lambda: beat.lost(silence_s=0.0)))
+    assert beat.lost(silence_s=600.0) is None
+
+
+def test_no_reader_in_another_process_ever_sees_half_a_beat(other: tuple[Beat, int]) -> None:
+    beat, _ = other
+    assert max(beat.age_s() for _ in range(500_000)) < 600.0, "a torn number looks hours old"
+
+
+@pytest.mark.parametrize("name", ["service", "cell"])
+def test_the_stop_process_latches_for_each_process_that_is_lost(tmp_path: Path, name: str) -> None:
+    latch, beat = Latch.create(tmp_path / "latch"), Beat(tmp_path, name)
+    watchdog = Watchdog(latch, tmp_path, silence_s=0.0)
+    latch.reset("test", seen_count=latch.state().count)
+    watchdog.look()
+    assert not latch.is_set(), "nobody has begun to give heartbeats"
+    beat.beat()
+    eventually(lambda: (watchdog.look(), latch.is_set())[1])
+    assert latch.state().source.startswith(f"the {name} process gave no sign of life")
+    count = latch.state().count
+    watchdog.look()
+    assert latch.state().count == count, "one loss is one stop"
+
+
+def test_the_state_of_a_process_is_that_of_the_operating_system() -> None:
+    assert process_state(os.getpid()) is ProcessState.RUNS
+    with subprocess.Popen([sys.executable, "-c", "pass"]) as process:
+        assert eventually(lambda: process_state(process.pid) is ProcessState.ENDED), "also before it is waited for"
+    assert process_state(process.pid) is ProcessState.ENDED

@@ -22,6 +22,7 @@ from service.access.actor import actor
 from service.access.keys import FILE as KEYS_FILE
 from service.access.keys import KeyBook
 from service.alarms.desk import AlarmDesk
+from service.commissioning.places import AllowedPlaces
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
 from service.history.observer import Observations
@@ -31,10 +32,12 @@ from service.operations import Operation, OperationContext
 from service.processes.device_slots import IN_MOTION
 from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
+from service.tasks.earlier_runs import tasks_of_earlier_runs
 from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
+from service.tasks.journal_watch import JournalWatch
 from service.tasks.lease import Command, LeaseDesk
-from service.tasks.model import Artefact, Task, TaskState
+from service.tasks.model import Task, TaskState
 from service.tasks.store import TaskContext, TaskStore
 from service.world_model import WorldModel
 
@@ -42,11 +45,12 @@ if TYPE_CHECKING:
     from service.processes.cell import CellRuntime
     from service.recording.session import RecordingSession
 
-RESTORED_TASKS = 100
+RECORDINGS = "recordings"  # folder below `runs_dir` of the files that clients may replay
 LOOK_S = 0.05
 ALARMS_S = 1.0
 RESTORED_ALARMS = 1000
 NO_LEASE = Command()
+NOTE_STOP_S = 0.01  # the stop port waits for the record before it answers
 COMMIT_S = 2.0  # an answer waits no longer for a slow disk
 log = logging.getLogger(__name__)
 
@@ -81,6 +85,7 @@ class Service:
         self.world = WorldModel()
         self.calibrations = Calibrations.of_runs(runs_dir, cell)
         self.started_s = time.monotonic()
+        self._allowed_places = AllowedPlaces.of(cell, runs_dir / RECORDINGS)
         state_dir = runs_dir / ".service"
         self._recording = None if record is None else self._record(record, inline)
         self.journal = Journal(state_dir / "journal.sqlite")
@@ -99,6 +104,7 @@ class Service:
             record=None if self._recording is None else self._recording.endpoint,
             replay=replay,
         )
+        self.journal_watch = JournalWatch(self.journal, self._on_no_record)
         recorder = self.journal if self._recording is None else self._recording.recorder(self.journal)
         self.tasks = TaskStore(state_dir / "tasks", recorder=recorder, stop_motion=self._stop_motion)
         if self._recording is not None:
@@ -112,7 +118,9 @@ class Service:
         self._is_closing = threading.Event()
         self._folder_lock = (state_dir / "lock").open("w")  # held until the process ends, even if it is killed
         if _is_alone(self._folder_lock):
-            self._restore_tasks()
+            for task in tasks_of_earlier_runs(self.journal):
+                self.tasks.restore(task)
+            self.tasks.sweep()
         else:  # tasks of the other service; those that run were not aborted
             log.warning("another panelwright writes to %s too: tasks of earlier runs are not shown", runs_dir)
 
@@ -126,6 +134,7 @@ class Service:
         for watch in (self._watch_stop, self._watch_lease):
             threading.Thread(target=watch, name=watch.__name__, daemon=True).start()
         threading.Thread(target=self._tend_alarms, name="alarms", daemon=True).start()
+        self.journal_watch.start()
         self.supervisor.start()
 
     def submit(
@@ -136,11 +145,13 @@ class Service:
         command: Command = NO_LEASE,
         key: str | None = None,
         is_followed: bool = False,
+        client: str | None = None,
     ) -> Task:
         """Start the operation `verb` as a task.
 
         Args:
             is_followed: whether a client must follow a motion that it asks for without a lease; see `sub_leases`.
+            client: the machine that asked for it.
 
         Raises:
             InvalidRequest: there is no such verb, or the request is not valid for this cell.
@@ -184,7 +195,7 @@ class Service:
                 return operation.run(context, request)
 
         plain = request.model_dump(mode="json")
-        task = self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key, sub_lease=sub)
+        task = self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key, sub_lease=sub, client=client)
         if moves:
             self._confirm(task, command.token)
         return task
@@ -200,7 +211,7 @@ class Service:
         try:
             self.lease.check(lease_token)
             if sub is not None:
-                sub.on_loss = lambda reason: self.tasks.cancel(task.id, reason=reason)
+                sub.on_loss = lambda reason: self._on_client_lost(task, reason)
                 sub.is_over = lambda: task.state.is_final
                 sub.check()
         except LeaseError as error:
@@ -213,11 +224,13 @@ class Service:
 
         Raises:
             DeviceUnavailable: the cell is not running.
+            InvalidRequest: the options name a port or host that this cell may not use.
             DeviceError, ConfigError: the new device did not connect; the old one is kept.
             MotionRefused, Busy: a motion or another swap is running.
             JournalError: it cannot be recorded.
         """
         self._check_cell()
+        self._allowed_places.check(name, section.options)
         check_wires(self.cell, {name: section})
         started_s = time.monotonic()
         told = {"device": name, "before": self.cell.file.devices[name].driver, "driver": section.driver}
@@ -249,6 +262,7 @@ class Service:
         self._is_closing.set()
         self.stop_quietly("the service ends")
         self.tasks.close()
+        self.journal_watch.close()
         self.supervisor.close()
         self.note("service-end", {})
         self.history.close()
@@ -283,8 +297,21 @@ class Service:
         if self.supervisor.is_ready:
             self.supervisor.connection.mover.cancel()
 
+    def _on_client_lost(self, task: Task, why: str) -> None:
+        """End the motion of a client that is lost, in the way that the cell file chooses."""
+        is_moving = task.state is TaskState.RUNNING
+        self.tasks.cancel(task.id, reason=why)
+        if is_moving and self.cell.file.safety.client_lost == "stop":
+            self.stop_quietly(why)
+
+    def _on_no_record(self, why: str) -> None:
+        """Latch the stop, because nothing may move without a record."""
+        if not self.supervisor.latch.is_set():
+            log.error("%s; the stop is latched", why)
+            self.stop_quietly(why)
+
     def _watch_stop(self) -> None:
-        while not self._is_closing.wait(LOOK_S):
+        while not self._is_closing.wait(NOTE_STOP_S):
             self.supervisor.note_stop()
 
     def _tend_alarms(self) -> None:
@@ -339,33 +366,6 @@ class Service:
 
         return RecordingSession.start(path, self.cell, calibrations=self.calibrations, inline=inline)
 
-    def _restore_tasks(self) -> None:
-        """Restore the tasks of earlier runs from the journal."""
-        tasks: dict[str, Task] = {}
-        kinds = ("task-queued", "task-started", "task-ended")
-        records = self.journal.records(kinds=kinds, limit=len(kinds) * RESTORED_TASKS)
-        for record in records:
-            data = record.data
-            if record.kind == "task-queued":
-                tasks[data["task"]] = Task(
-                    id=data["task"],
-                    verb=data["verb"],
-                    request=data["request"],
-                    moves=True,
-                    holder=data["holder"],
-                    key=data.get("key"),
-                    created_s=record.wall_time_s,
-                )
-            elif data["task"] not in tasks:
-                continue
-            elif record.kind == "task-started":
-                tasks[data["task"]].state, tasks[data["task"]].started_s = TaskState.RUNNING, record.wall_time_s
-            else:
-                _bring_to_end(tasks[data["task"]], data, record.wall_time_s)
-        for task in tasks.values():
-            self.tasks.restore(task)
-        self.tasks.sweep()
-
 
 def book_of(runs_dir: Path) -> KeyBook:
     """Return the keys of the service with this folder."""
@@ -379,16 +379,6 @@ def _is_alone(lock: IO[str]) -> bool:
     except OSError:
         return False
     return True
-
-
-def _bring_to_end(task: Task, data: dict[str, Any], ended_s: float) -> None:
-    """Set state and result of a restored task from its last record."""
-    task.result, task.problem = data["result"], data["problem"]
-    task.artefacts = [Artefact(**item) for item in data["artefacts"]]
-    task.started_s, task.ended_s = data.get("started_s"), ended_s
-    task.state = TaskState(data["state"])
-    fraction = 1.0 if task.state is TaskState.SUCCEEDED else float(data.get("fraction", 0.0))
-    task.add_event("state", fraction=fraction, step=str(data.get("step", "")))
 
 
 def stopped(source: str) -> Stopped:

@@ -179,7 +179,7 @@ class Panelwright:
         # FastAPI hides this warning with `catch_warnings`, which imports in the cell's thread can undo meanwhile.
         warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)
         threading.Thread(target=self._start_service, name="start-cell", daemon=True).start()
-        from service.http.app import create_app, state_of_app
+        from service.http.app import create_app, load_of_app, state_of_app
         from service.http.guard import Allowed
         from service.http.server import HttpServer
 
@@ -194,9 +194,10 @@ class Panelwright:
             self._is_ending.set()
             self.service.stop_quietly(why)
             state_of_app(app).hub.close()
+            load_of_app(app).end()
 
         tls = (exposure.tls_cert, exposure.tls_key) if exposure.tls_cert and exposure.tls_key else None
-        self._server = HttpServer(app, self._listeners, on_exit=on_exit, tls=tls)
+        self._server = HttpServer(app, self._listeners, load=load_of_app(app), on_exit=on_exit, tls=tls)
         if self._wants_warmth:  # at the same time as the cell's start, which waits for another process
             from service.warm import load_modules
 

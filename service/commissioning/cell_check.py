@@ -94,7 +94,7 @@ def objects_in_reach(cell: Cell) -> dict[str, bool] | None:
     flange_from_grip = transform_rpy(mount.position_m, mount.rpy_rad)
     w = cell.file.workspace
     base_from_panel = transform_rpy(w.panel_position_m, w.panel_rpy_rad)
-    kinematics = Kinematics.of(arm)
+    kinematics = Kinematics.of(arm, cell.file.safety.joint_limits_rad)
     return {
         each.name: is_in_reach(kinematics, base_from_panel, flange_from_grip, each.point_m)
         for each in cell.panel.objects

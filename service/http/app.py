@@ -37,6 +37,7 @@ from service.http.access import check_access
 from service.http.guard import Allowed, RequestGuard
 from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
+from service.http.load import Load
 from service.http.metrics import Metrics
 from service.http.models import FaultRequest, LeaseRequest, ResetRequest, SwapRequest, TakeOverRequest
 from service.http.page import Page
@@ -122,6 +123,12 @@ def state_of_app(guarded: ASGIApp) -> AppState:
     return state
 
 
+def load_of_app(guarded: ASGIApp) -> Load:
+    """Return the limits of an application that `create_app` made."""
+    assert isinstance(guarded, RequestGuard)  # noqa: S101 - narrowing: `create_app` returns a RequestGuard
+    return guarded.load
+
+
 @contextlib.asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     state: AppState = app.state.panelwright
@@ -130,7 +137,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     yield
     probe.cancel()
     state.hub.close()
-    for pool in (state.pool, state.control_pool):
+    for pool in (state.pool, state.control_pool, state.stop_pool):
         pool.shutdown(wait=False, cancel_futures=True)
 
 

@@ -75,7 +75,7 @@ async def stop(state: State, request: Request) -> StopView:
     The same request to the stop process (`stop_url`) is faster, and works even if this service hangs.
     """
     peer = request.client.host if request.client is not None else "local"
-    return _stop(state, await state.act(lambda: state.service.supervisor.stop(f"POST /v1/stop from {peer}")))
+    return _stop(state, await state.stop(lambda: state.service.supervisor.stop(f"POST /v1/stop from {peer}")))
 
 
 @router.post(

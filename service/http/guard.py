@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +11,9 @@ from fastapi import FastAPI
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.http.problems import BodyTooLarge, problem_response
+from hal.errors import Retry
+from service.http.load import MAX_BODY_BYTES_OVERALL, Load, body_time_s
+from service.http.problems import BodyTimeout, BodyTooLarge, TooManyUploads, problem_response
 from service.knowledge.images import MAX_IMAGE_BYTES
 
 MAX_BODY_BYTES = 1_000_000
@@ -45,13 +48,18 @@ class Allowed:
 
 
 class RequestGuard:
-    """ASGI middleware that refuses requests before the application sees them."""
+    """ASGI middleware that refuses requests before the application sees them.
+
+    Attributes:
+        load: what the requests use at present.
+    """
 
     def __init__(self, app: FastAPI, *, allowed: Allowed, count: Callable[[int], None]) -> None:
         self.inner = app
         self._app: ASGIApp = app
         self._allowed = allowed
         self._count = count
+        self.load = Load()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse the request, or pass it on with a limited body, and add security headers to the answer."""
@@ -69,7 +77,20 @@ class RequestGuard:
             self._count(status)
             await problem_response(status, "request-refused", what, hint=hint)(scope, receive, send)
             return
-        await self._app(scope, _limited(receive, _most_bytes(scope)), self._sender(send))
+        client = (scope.get("client") or ("local",))[0]
+        too_many = self.load.refusal(scope["path"], client)
+        if too_many is not None and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1013, "reason": too_many})
+            return
+        if too_many is not None:
+            self._count(503)
+            again = {"Retry-After": "1"}
+            busy = problem_response(503, "busy", too_many, hint="wait for their end", retry=Retry.SAFE, headers=again)
+            await busy(scope, receive, send)
+            return
+        with self.load.request(client), LimitedBody(receive, self.load, most_bytes=_most_bytes(scope)) as body:
+            takes = receive if scope["type"] == "websocket" else body.receive
+            await self._app(scope, takes, self._sender(send))
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str, str] | None:
         if self._allowed.proxies is not None and not scope[PROXIED] and not _is_of_this_machine(scope):
@@ -137,20 +158,52 @@ def _most_bytes(scope: Scope) -> int:
     return LARGE_BODIES.get((scope.get("method", ""), scope["path"]), MAX_BODY_BYTES)
 
 
-def _limited(receive: Receive, most_bytes: int) -> Receive:
-    """Count the bytes that really arrive, because a chunked body announces no length."""
-    total = 0
+class LimitedBody:
+    """Receives a body with limits for its size, its time and the memory of all bodies; a context that releases the memory.
 
-    async def counted() -> Message:
-        nonlocal total
-        message = await receive()
+    The bytes that really arrive are counted, because a chunked body announces no length.
+    """
+
+    def __init__(self, receive: Receive, load: Load, *, most_bytes: int) -> None:
+        self._receive = receive
+        self._load = load
+        self._most_bytes = most_bytes
+        self._total = 0
+        self._begun_s = asyncio.get_running_loop().time()
+        self._is_complete = False
+
+    def __enter__(self) -> LimitedBody:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._load.body_bytes -= self._total
+
+    async def receive(self) -> Message:
+        """Return the next message.
+
+        Raises:
+            BodyTooLarge, BodyTimeout, TooManyUploads: a limit was exceeded.
+        """
+        if self._is_complete:  # the application waits for the client to leave
+            return await self._receive()
+        left_s = self._begun_s + body_time_s(self._total) - asyncio.get_running_loop().time()
+        try:
+            async with self._load.body_time(left_s):
+                message = await self._receive()
+        except TimeoutError:
+            raise BodyTimeout from None
         if message["type"] == "http.request":
-            total += len(message.get("body", b""))
-            if total > most_bytes:
-                raise BodyTooLarge
+            self._take(len(message.get("body", b"")))
+            self._is_complete = not message.get("more_body", False)
         return message
 
-    return counted
+    def _take(self, size: int) -> None:
+        self._total += size
+        self._load.body_bytes += size
+        if self._total > self._most_bytes:
+            raise BodyTooLarge
+        if self._load.body_bytes > MAX_BODY_BYTES_OVERALL:
+            raise TooManyUploads
 
 
 def _hostname(host: str) -> str:

@@ -34,10 +34,11 @@ async def readyz(state: State) -> JSONResponse:
     supervisor, is_running = service.supervisor, service.supervisor.is_ready
     missing = [MissingView(**asdict(one), lost=list(service.lost_without(one.device))) for one in supervisor.missing]
     view = ReadyView(
-        is_ready=is_running and not missing,
+        is_ready=is_running and not missing and service.journal_watch.problem is None,
         is_running=is_running,
         missing=missing,
         lacking={verb: list(devices) for verb, devices in service.lacking().items()},
+        journal_problem=service.journal_watch.problem,
         processes=[ProcessView(**asdict(process)) for process in supervisor.processes()],
     )
     return JSONResponse(view.model_dump(mode="json"), 200 if is_running else 503)

@@ -290,15 +290,17 @@ class MissingView(BaseModel):
 class ReadyView(BaseModel):
     """Whether the cell is ready for everything, and otherwise for what.
 
-    `is_ready` is true when the cell runs and no device is missing. `is_running` is true when the cell runs, even if devices
-    are missing; it decides the status, 200 or 503. `lacking` has for each verb the missing devices that it may need: a verb
-    with none is ready, and one with some may fail, depending on the request.
+    `is_ready` is true when the cell runs, no device is missing and the journal can record. `is_running` is true when the cell
+    runs, even if devices are missing; it decides the status, 200 or 503. `lacking` has for each verb the missing devices that
+    it may need: a verb with none is ready, and one with some may fail, depending on the request. `journal_problem` says why
+    nothing can be recorded, so that nothing may move.
     """
 
     is_ready: bool
     is_running: bool
     missing: list[MissingView]
     lacking: dict[str, list[str]]
+    journal_problem: str | None
     processes: list[ProcessView]
 
 

@@ -115,6 +115,14 @@ class BodyTooLarge(Exception):
     """The request's body has more bytes than allowed."""
 
 
+class BodyTimeout(Exception):
+    """The request's body did not come in time."""
+
+
+class TooManyUploads(Exception):
+    """The bodies of all requests together take too much memory."""
+
+
 def install(app: FastAPI, *, paths: Sequence[str]) -> None:
     """Register the handlers; `paths` are all known paths, from which the hint for a mistyped one is chosen."""
 
@@ -138,6 +146,16 @@ def install(app: FastAPI, *, paths: Sequence[str]) -> None:
         return problem_response(
             400, "body-cut-off", "the client left before its body was complete", hint="send it again"
         )
+
+    @app.exception_handler(BodyTimeout)
+    async def _too_slow(_request: Request, _error: BodyTimeout) -> Response:
+        what, close = "the body did not come in time", {"Connection": "close"}
+        return problem_response(408, "body-timeout", what, hint="send it again", retry=Retry.SAFE, headers=close)
+
+    @app.exception_handler(TooManyUploads)
+    async def _too_many(_request: Request, _error: TooManyUploads) -> Response:
+        what, later = "too much is being sent at the same time", {"Connection": "close", "Retry-After": "5"}
+        return problem_response(503, "busy", what, hint="send it again later", retry=Retry.SAFE, headers=later)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> Response:

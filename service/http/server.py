@@ -11,6 +11,8 @@ from types import FrameType
 import uvicorn
 from starlette.types import ASGIApp
 
+from service.http.load import Load, limited_protocol
+
 GRACE_S = 2
 
 
@@ -31,6 +33,7 @@ class HttpServer:
     """An HTTP server on bound sockets.
 
     Args:
+        load: limits of the connections; the same as of the application's guard.
         tls: files with certificate and key; None for plain HTTP.
         on_exit: called first when a signal or `stop` ends the server; stops the arm and ends the streams.
     """
@@ -40,19 +43,21 @@ class HttpServer:
         app: ASGIApp,
         listeners: list[socket.socket],
         *,
+        load: Load,
         on_exit: Callable[[str], None],
         tls: tuple[Path, Path] | None = None,
     ) -> None:
         config = uvicorn.Config(
             app,
+            http=limited_protocol(load),
             log_level="warning",
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=GRACE_S,
             timeout_keep_alive=10,
-            limit_concurrency=400,
             h11_max_incomplete_event_size=65_536,
             ws_max_size=65_536,
+            ws_per_message_deflate=False,  # compressing each sample for each listener takes longer than sending it
             proxy_headers=False,  # the guard reads them, and only those of a proxy that is named
             ssl_certfile=tls[0] if tls is not None else None,
             ssl_keyfile=tls[1] if tls is not None else None,

@@ -60,7 +60,7 @@ class Sampler:
 
     async def _text(self) -> str:
         try:
-            return json.dumps(await self._state.in_thread(self._sample))
+            return await self._state.in_thread(lambda: json.dumps(self._sample()))
         except CellError as error:  # for example too many waiting reads: report it and continue
             return json.dumps({"problem": error.what})
         except Exception as error:  # a defect must not leave all listeners waiting endlessly
@@ -123,7 +123,9 @@ async def _has_sent_key(socket: WebSocket, state: AppState) -> bool:
 
 async def _forward(socket: WebSocket, mailbox: asyncio.Queue[str]) -> None:
     try:
-        await socket.send_text(await asyncio.wait_for(mailbox.get(), 0.5))
+        async with asyncio.timeout(0.5):
+            text = await mailbox.get()
+        await socket.send_text(text)
     except TimeoutError:
         return
 

@@ -8,9 +8,9 @@ from typing import get_args
 from hal.config import DeviceSection
 from hal.errors import ConfigError, InvalidRequest
 from hal.registry import device_factory, options_model
+from service.core import RECORDINGS
 from service.processes.device_slots import WIRE_KEYS
 
-RECORDINGS = "recordings"
 ALWAYS_FILES = {"capture", "replay"}  # also in drivers that do not declare their options
 
 

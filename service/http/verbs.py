@@ -48,7 +48,13 @@ def _add(routes: APIRouter, operation: Operation) -> None:
         idempotency_key: IdempotencyKey = None,
     ) -> Response:
         submit = functools.partial(
-            state.service.submit, operation.name, request, command=command, key=idempotency_key, is_followed=True
+            state.service.submit,
+            operation.name,
+            request,
+            command=command,
+            key=idempotency_key,
+            is_followed=True,
+            client=connection.client.host if connection.client is not None else None,
         )
         task = await state.act(submit)
         if wait_s > 0.0:

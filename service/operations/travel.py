@@ -133,7 +133,10 @@ def kinematics(session: Session) -> Kinematics:
     """Return the arm's kinematics, which are built once per cell."""
     connection = session.connection
     return session.world.kinematics(
-        lambda: Kinematics.of(connection.device(session.first(DeviceKind.ARM)).capabilities())
+        lambda: Kinematics.of(
+            connection.device(session.first(DeviceKind.ARM)).capabilities(),
+            connection.cell.file.safety.joint_limits_rad,
+        )
     )
 
 

@@ -25,13 +25,24 @@ from typing import Any
 
 from service.access.actor import signed
 from service.errors import JournalError
-from service.tasks.journal_parts import HEAD_SCHEMA, INSERT_ROW, SCHEMA, key_of, parts_of, snapshot, write_part
+from service.tasks.journal_parts import (
+    HEAD_SCHEMA,
+    INSERT_ROW,
+    SCHEMA,
+    key_of,
+    marks_of,
+    parts_of,
+    snapshot,
+    write_part,
+)
 from service.tasks.journal_reader import DROPPED, FIRST_HASH, Record, chain_hash, read_records, seal, verify_chain
 
 MAX_GROUP = 200
 MAX_KEPT = 1000  # notes kept in memory while the disk is full
 PART_BYTES = 16_000_000  # some ten thousand rows
 KEEP_PARTS = 8  # together with the live file about 150 MB
+LOST = "journal-lost"  # kind of the first row after the files of the journal were deleted while a service ran
+FAILED = "journal-failed"  # kind of the row that says that a commit failed before
 log = logging.getLogger(__name__)
 APPEND_TIMEOUT_S = 10.0
 
@@ -43,6 +54,15 @@ class _Entry:
     wall_time_s: float
     monotonic_s: float
     done: Future[None] | None  # None for a note, which nobody waits for
+
+    @classmethod
+    def now(cls, kind: str, data: dict[str, Any], done: Future[None] | None = None) -> _Entry:
+        """Return an entry with the present time."""
+        text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+        return cls(kind=kind, text=text, wall_time_s=time.time(), monotonic_s=time.monotonic(), done=done)
+
+
+WAKE = _Entry.now("wake", {})  # never written
 
 
 class Journal:
@@ -63,6 +83,10 @@ class Journal:
         self._hand_over_at = part_bytes
         self._waiting: queue.SimpleQueue[_Entry | None] = queue.SimpleQueue()
         self._is_closed = False
+        self._marks = marks_of(path)
+        self._ended: tuple[int, str] | None = None  # the last row of files that were deleted
+        self.failure: str | None = None  # why the last commit failed
+        self.losses = 0  # how often its files were deleted or replaced while it was open
         ready: Future[None] = Future()
         self._thread = threading.Thread(target=self._write, args=(ready,), name="journal", daemon=True)
         self._thread.start()
@@ -93,6 +117,14 @@ class Journal:
         """Return the newest records of the given kinds (of all kinds when empty), oldest first."""
         return read_records(self.path, kinds=kinds, limit=limit)
 
+    def try_again(self) -> None:
+        """Write what could not be written before, and begin new files if the old ones were deleted; returns at once."""
+        self._waiting.put(WAKE)
+
+    def is_lost(self) -> bool:
+        """Whether its files were deleted or replaced; rows that are written now would be in no file."""
+        return marks_of(self.path) != self._marks
+
     def verify(self) -> int:
         """Check the whole chain; see `verify_chain`."""
         return verify_chain(self.path)
@@ -108,14 +140,7 @@ class Journal:
     def _put(self, kind: str, data: dict[str, Any], done: Future[None] | None) -> None:
         if self._is_closed or not self._thread.is_alive():
             raise JournalError("the journal is closed", hint="restart the service")
-        entry = _Entry(
-            kind=kind,
-            text=json.dumps(signed(data), separators=(",", ":"), allow_nan=False),
-            wall_time_s=time.time(),
-            monotonic_s=time.monotonic(),
-            done=done,
-        )
-        self._waiting.put(entry)
+        self._waiting.put(_Entry.now(kind, signed(data), done))
 
     def _write(self, ready: Future[None]) -> None:
         try:
@@ -124,13 +149,39 @@ class Journal:
         except (sqlite3.Error, OSError) as error:
             ready.set_exception(_error(self.path, error))
             return
+        self._marks = marks_of(self.path)
         ready.set_result(None)
         is_last, kept = False, list[_Entry]()
         while not is_last:
             group, is_last = self._next_group()
-            kept = _commit(db, self.path, [*kept, *group], key)
-            self._hand_over(db, key)
+            if self.is_lost() and not is_last:
+                kept, (db, key) = _refuse(self.path, [*kept, *group]), self._begin_again(db, key)
+                continue
+            kept, self.failure = _commit(db, self.path, [*kept, *group], key)
+            if self.failure is None:
+                self._hand_over(db, key)
         db.close()
+
+    def _begin_again(self, db: sqlite3.Connection, key: bytes) -> tuple[sqlite3.Connection, bytes]:
+        """Open new files in place of those that were deleted; the first row says where the old chain ended."""
+        with contextlib.suppress(sqlite3.Error):  # it is closed already when the last attempt failed
+            self._ended = db.execute("SELECT id, hash FROM journal ORDER BY id DESC LIMIT 1").fetchone()
+            db.close()  # before the new files are opened, because connections of a process share what they know of the WAL
+        try:
+            fresh_key = key_of(self.path)
+            fresh = _opened(self.path, fresh_key)
+            told = _Entry.now(
+                LOST, {"last": None if self._ended is None else dict(zip(("id", "hash"), self._ended, strict=True))}
+            )
+            _, self.failure = _commit(fresh, self.path, [told], fresh_key)
+        except (sqlite3.Error, OSError) as error:
+            self.failure = str(error)
+            log.error("%s was deleted and cannot be made again: %s", self.path, error)
+            return db, key
+        self._marks = marks_of(self.path)
+        self.losses += 1
+        log.error("%s was deleted or replaced while the service ran; a new one begins", self.path)
+        return fresh, fresh_key
 
     def _hand_over(self, db: sqlite3.Connection, key: bytes) -> None:
         """Move rows to an older part when the live file is too large; a failure loses no row and is tried again later."""
@@ -151,7 +202,8 @@ class Journal:
         group: list[_Entry] = []
         entry = self._waiting.get()
         while entry is not None:
-            group.append(entry)
+            if entry is not WAKE:
+                group.append(entry)
             if len(group) == MAX_GROUP:
                 return group, False
             try:
@@ -187,10 +239,21 @@ def _last_hash(db: sqlite3.Connection) -> str:
     return str(row[0]) if row is not None else FIRST_HASH
 
 
-def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry], key: bytes) -> list[_Entry]:
-    """Write a group in one transaction and notify its callers; returns the notes that did not fit on the disk."""
+def _refuse(path: Path, group: list[_Entry]) -> list[_Entry]:
+    """Tell the callers of a group that their entries were not written; returns the notes, which nobody waits for."""
+    for entry in group:
+        if entry.done is not None:
+            entry.done.set_exception(_error(path, OSError("its files were deleted or replaced")))
+    return [entry for entry in group if entry.done is None][-MAX_KEPT:]
+
+
+def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry], key: bytes) -> tuple[list[_Entry], str | None]:
+    """Write a group in one transaction and notify its callers.
+
+    Returns the notes that did not fit on the disk, and why the commit failed.
+    """
     if not group:
-        return []
+        return [], None
     try:
         db.execute("BEGIN IMMEDIATE")
         for entry in group:
@@ -201,16 +264,18 @@ def _commit(db: sqlite3.Connection, path: Path, group: list[_Entry], key: bytes)
         with contextlib.suppress(sqlite3.Error):  # after a failed commit this may fail too
             db.execute("ROLLBACK")
         notes = [entry for entry in group if entry.done is None]
-        if notes:
+        if not any(entry.kind == FAILED for entry in notes):
+            notes.append(_Entry.now(FAILED, {"why": str(error)}))
+        if len(notes) > 1:
             log.error("not recorded yet: %s: %s", ", ".join(entry.kind for entry in notes), error)
         for entry in group:
             if entry.done is not None:
                 entry.done.set_exception(_error(path, error))
-        return notes[-MAX_KEPT:]
+        return notes[-MAX_KEPT:], str(error)
     for entry in group:
         if entry.done is not None:
             entry.done.set_result(None)
-    return []
+    return [], None
 
 
 def _insert(db: sqlite3.Connection, entry: _Entry) -> None:
@@ -248,14 +313,7 @@ def _dropped(parts: list[Path]) -> _Entry:
     """Return the row that records which rows were deleted."""
     with snapshot(parts[-1]) as db:
         number, digest = db.execute("SELECT id, hash FROM journal ORDER BY id DESC LIMIT 1").fetchone()
-    told = {"id": number, "hash": digest, "files": [part.name for part in parts]}
-    return _Entry(
-        kind=DROPPED,
-        text=json.dumps(told, separators=(",", ":")),
-        wall_time_s=time.time(),
-        monotonic_s=time.monotonic(),
-        done=None,
-    )
+    return _Entry.now(DROPPED, {"id": number, "hash": digest, "files": [part.name for part in parts]})
 
 
 def _size_bytes(db: sqlite3.Connection) -> int:

@@ -52,6 +52,20 @@ def key_of(live: Path) -> bytes:
     return key
 
 
+def marks_of(live: Path) -> tuple[tuple[int, int] | None, ...]:
+    """Return what identifies the open files of a journal (device and inode); None for a file that does not exist."""
+    files = (live, live.with_name(live.name + "-wal"), live.with_suffix(".key"))
+    return tuple(_mark(path) for path in files)
+
+
+def _mark(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 def parts_of(live: Path) -> list[Path]:
     """Return the older parts of the journal whose live file is `live`, oldest first."""
     name = re.compile(rf"{re.escape(live.stem)}-\d{{12}}-\d{{12}}{re.escape(live.suffix)}")

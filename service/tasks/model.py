@@ -81,6 +81,7 @@ class Task:
         by: name of the key that asked for it; None while the service has no keys.
         key: the caller's idempotency key.
         sub_lease: its right to move; None when it does not move, and for a task of an earlier run.
+        client: the machine that asked for it; tasks of one client may not fill the queue.
         problem: why it failed, as plain values.
         created_s, started_s, ended_s: wall time, for display only.
     """
@@ -93,6 +94,7 @@ class Task:
     by: str | None = None
     key: str | None = None
     sub_lease: SubLease | None = None
+    client: str | None = None
     state: TaskState = TaskState.QUEUED
     result: Any = None
     problem: ProblemFields | None = None

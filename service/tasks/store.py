@@ -98,7 +98,7 @@ class TaskStore:
         folder: artefacts go to `folder/<task id>/`.
         recorder: the journal; a task is acknowledged after its record is on disk.
         stop_motion: ends the running motion; called at a cancellation and repeatedly until the task has ended.
-        max_queued: more waiting tasks than this are refused with `Busy`.
+        max_queued: more waiting tasks than this are refused with `Busy`; of one client, more than half of it.
         keep: number of finished tasks that are kept; the artefacts of older ones are removed.
     """
 
@@ -136,6 +136,7 @@ class TaskStore:
         holder: str | None = None,
         key: str | None = None,
         sub_lease: SubLease | None = None,
+        client: str | None = None,
     ) -> Task:
         """Queue a task; the same idempotency `key` with the same request returns the same task again.
 
@@ -148,9 +149,9 @@ class TaskStore:
             earlier = self._with_key(key, verb, request)
             if earlier is not None:
                 return earlier
-            self._check_room()
+            self._check_room(client)
             task = Task(id=secrets.token_hex(8), verb=verb, request=request, moves=moves, holder=holder, key=key)
-            task.by, task.sub_lease, task.on_change = actor(), sub_lease, self._changed
+            task.by, task.sub_lease, task.client, task.on_change = actor(), sub_lease, client, self._changed
             self._tasks[task.id] = task
             forgotten = self._forget_old()
         self._remove_artefacts(forgotten)
@@ -297,10 +298,13 @@ class TaskStore:
         task.result = result
         task.problem = problem_of(error) if error is not None else None
         # Recorded before it becomes visible, so that an end that a client has seen survives a power failure.
-        self._record_end(task, state)
+        unrecorded = self._record_end(task, state)
+        if unrecorded is not None and state is TaskState.SUCCEEDED:
+            task.problem, state = problem_of(unrecorded), TaskState.FAILED
         task.move_to(state)
 
-    def _record_end(self, task: Task, state: TaskState | None = None) -> None:
+    def _record_end(self, task: Task, state: TaskState | None = None) -> CellError | None:
+        """Record the end of a task; returns the error if that was not possible."""
         ended = {"task": task.id, "state": str(state or task.state), "result": task.result, "problem": task.problem}
         ended |= {"fraction": task.fraction, "step": task.step, "started_s": task.started_s}
         try:
@@ -308,6 +312,8 @@ class TaskStore:
         except CellError as error:
             level = logging.INFO if self._is_closed else logging.ERROR  # after closing, the next start reports it
             log.log(level, "the end of task %s was not recorded: %s", task.id, error)
+            return error
+        return None
 
     def _stop_until_ended(self, task: Task) -> None:
         self._quiet_stop()
@@ -336,12 +342,15 @@ class TaskStore:
             )
         return earlier
 
-    def _check_room(self) -> None:
+    def _check_room(self, client: str | None) -> None:
         if self._is_closed:
             raise Busy("the service is ending", hint="wait for its restart")
-        queued = sum(task.state is TaskState.QUEUED for task in self._tasks.values())
+        waiting = [task for task in self._tasks.values() if task.state is TaskState.QUEUED]
+        queued, own = len(waiting), sum(client is not None and task.client == client for task in waiting)
         if queued >= self._max_queued:
             raise Busy(f"{queued} tasks wait already", hint="wait for one to end or cancel one", queued=queued)
+        if 2 * own >= self._max_queued:
+            raise Busy(f"{own} tasks of {client} wait already", hint="wait for one to end or cancel one", queued=own)
 
     def _forget_old(self) -> list[str]:
         ended = [task.id for task in self._tasks.values() if task.state.is_final]

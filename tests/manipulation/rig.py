@@ -223,7 +223,9 @@ class Rig:
     latched: list[bool]
 
 
-def make_rig(*, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25) -> Rig:
+def make_rig(
+    *, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25, safety: SafetySection | None = None
+) -> Rig:
     """Return a started controller; the caller must close `rig.controller`."""
     world, latched = World(), [False]
     controller = Controller(
@@ -235,7 +237,7 @@ def make_rig(*, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25)
             proximities=(FakeProximity("proximity_left", world),),
         ),
         clock=world.clock,
-        safety=SafetySection(force_limit_n=force_limit_n, speed_limit_m_per_s=speed_limit_m_per_s),
+        safety=safety or SafetySection(force_limit_n=force_limit_n, speed_limit_m_per_s=speed_limit_m_per_s),
         load=LOAD,
         flange_from_sensor=SENSOR,
         is_latched=lambda: latched[0],

@@ -218,9 +218,13 @@ def served_alone(write_cell: WriteCell, tmp_path: Path) -> Iterator[Served]:
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_no_end_of_the_service_leaves_an_orphan(served_alone: Served, how: signal.Signals) -> None:
     assert len(served_alone.family) >= 2, "a cell and a stop process at least"
-    os.kill(served_alone.process.pid, how)
-    served_alone.process.wait(90)
+    with socket.create_connection(("127.0.0.1", served_alone.port)) as upload:
+        upload.sendall(b"POST /v1/echo HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n")
+        upload.sendall(b"Content-Length: 100000\r\n\r\n{")
+        os.kill(served_alone.process.pid, how)
+        served_alone.process.wait(90)
     eventually(lambda: not served_alone.survivors())
+    assert "Exception" not in served_alone.log.read_text(), "the upload that was cut is no defect"
     assert "Traceback" not in served_alone.log.read_text()
     assert (how is signal.SIGKILL) is ("processes ended" not in served_alone.log.read_text())
 

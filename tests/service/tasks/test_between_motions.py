@@ -157,3 +157,22 @@ def test_a_stop_that_is_pressed_while_a_simulated_cell_starts_stays(
         assert service.supervisor.latch.is_set() is is_pressed
     finally:
         service.close()
+
+
+@pytest.mark.parametrize("action", ["hold", "stop"])
+def test_the_cell_file_chooses_what_happens_when_the_client_of_a_motion_is_lost(
+    write_cell: WriteCell, tmp_path: Path, action: str
+) -> None:
+    cell = load_cell(write_cell(robot=True, extra=f'[safety]\nlease_ttl_s = 1.0\nclient_lost = "{action}"'))
+    service = Service(cell, OPERATIONS, runs_dir=tmp_path / "runs", inline=True)
+    service.start()
+    try:
+        alice = service.lease.acquire("alice")
+        task = service.submit("hold", HoldRequest(), lease_token=alice.token)
+        assert task.wait(PATIENCE_S), "nobody gives a heartbeat"
+        assert task.state is not TaskState.SUCCEEDED
+        assert service.supervisor.latch.is_set() is (action == "stop")
+        if action == "stop":
+            assert "alice lapsed" in service.supervisor.latch.state().source
+    finally:
+        service.close()

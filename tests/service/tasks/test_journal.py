@@ -231,7 +231,7 @@ def test_a_failed_commit_reaches_its_caller_and_the_chain_goes_on(tmp_path: Path
     with sqlite3.connect(tmp_path / "j.sqlite") as db:
         db.execute("DROP TRIGGER full")
     journal.append("good again", {})
-    assert [record.kind for record in journal.records()] == ["good", "stop", "good again"]
+    assert [record.kind for record in journal.records()] == ["good", "stop", "journal-failed", "good again"]
     assert journal.verify() == 3
     journal.close()
 

@@ -1,0 +1,120 @@
+"""Silent, slow and greedy clients shut nobody out: stop and health are always answered."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import httpx2
+import pytest
+
+from hal.errors import CellError
+from service.errors import Busy
+from service.serve import Panelwright
+from tests.service.verbs import HoldRequest
+from tests.service.waiting import eventually
+
+UPLOAD = b"POST /v1/images HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: image/png\r\nContent-Length: 900000\r\n\r\n"
+STOP = b"POST /v1/stop HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n"
+
+
+@contextmanager
+def connected(served: Panelwright) -> Iterator[socket.socket]:
+    with socket.create_connection((served.host, served.port), timeout=60.0) as link:
+        yield link
+
+
+def test_405_silent_connections_shut_nobody_out(served: Panelwright, client: httpx2.Client) -> None:
+    with ExitStack() as crowd:
+        links = [crowd.enter_context(connected(served)) for _ in range(405)]
+        with httpx2.Client(base_url=served.url, timeout=30.0, trust_env=False) as fresh:
+            assert fresh.get("/healthz").status_code == 200
+            assert fresh.post("/v1/stop").json()["is_latched"]
+        assert links[0].recv(1) == b"", "the connection that was silent for the longest time is closed"
+
+
+def test_a_head_that_never_comes_ends_its_connection(
+    served: Panelwright, client: httpx2.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.http.load.HEAD_S", 0.05)
+    with connected(served) as silent, connected(served) as slow:
+        slow.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127")
+        assert (silent.recv(1), slow.recv(1)) == (b"", b"")
+    with connected(served) as second:  # also after an answer on the same connection
+        second.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert b"200 OK" in second.recv(4000)
+        second.sendall(b"GET /heal")
+        assert second.recv(4000) == b""
+
+
+def test_a_body_that_never_comes_is_a_problem(
+    served: Panelwright, client: httpx2.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.http.load.BODY_S", 0.05)
+    with connected(served) as link:
+        link.sendall(UPLOAD + b"x")
+        answer = link.recv(4000)
+    assert b"408" in answer.partition(b"\r\n")[0] and b"body-timeout" in answer
+    with connected(served) as link:
+        link.sendall(STOP)
+        assert b"200 OK" in link.recv(4000).partition(b"\r\n")[0], "a stop does not wait for a body"
+
+
+def test_uploads_that_never_end_do_not_fill_the_memory(
+    served: Panelwright, client: httpx2.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.http.guard.MAX_BODY_BYTES_OVERALL", 1_000_000)
+    with ExitStack() as uploads:
+        links = [uploads.enter_context(connected(served)) for _ in range(3)]
+        for link in links[:2]:
+            link.sendall(UPLOAD + bytes(450_000))
+        links[2].sendall(UPLOAD + bytes(450_000))
+        refused = [link for link in links if eventually(lambda link=link: link is not links[2] or _has_answer(link))]
+        assert refused and b"503" in links[2].recv(4000).partition(b"\r\n")[0]
+        assert client.post("/v1/stop").json()["is_latched"]
+    eventually(lambda: client.post("/v1/echo?wait_s=5", json={"text": "x" * 90}).status_code == 200)
+
+
+def _has_answer(link: socket.socket) -> bool:
+    link.settimeout(0.2)
+    try:
+        return bool(link.recv(1, socket.MSG_PEEK))
+    except TimeoutError:
+        return False
+
+
+def test_one_client_cannot_fill_the_queue_of_all(served: Panelwright, client: httpx2.Client) -> None:
+    def ask(name: str) -> str:
+        return served.service.submit("hold", HoldRequest(), client=name).id
+
+    started = [ask("10.0.0.1")]
+    eventually(lambda: served.service.tasks.get(started[0]).state == "running")
+    started += [ask("10.0.0.1") for _ in range(8)]
+    with pytest.raises(Busy, match=r"8 tasks of 10\.0\.0\.1"):
+        ask("10.0.0.1")
+    started += [ask("10.0.0.2") for _ in range(8)]
+    with pytest.raises(CellError, match="16 tasks wait"):
+        ask("10.0.0.3")
+    served.service.tasks.cancel_moving("test")
+    for task in started:
+        eventually(lambda task=task: served.service.tasks.get(task).state.is_final)
+
+
+def test_too_many_requests_of_one_client_are_refused_but_stop_and_health_are_not(
+    served: Panelwright, client: httpx2.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.http.load.MAX_REQUESTS_OF_CLIENT", 2)
+    with connected(served) as one, connected(served) as other:
+        for link in (one, other):
+            link.sendall(UPLOAD + b"x")
+        refused = eventually(lambda: _refused(client))
+        assert refused.json()["type"] == "urn:panelwright:busy"
+        assert refused.headers["Retry-After"] == "1"
+        assert client.get("/healthz").status_code == 200
+        assert client.post("/v1/stop").status_code == 200
+
+
+def _refused(client: httpx2.Client) -> httpx2.Response | None:
+    answer = client.get("/v1/tasks")
+    return answer if answer.status_code == 503 else None

@@ -95,13 +95,49 @@ class SimulationSection(Strict):
     ] = 0.14
 
 
+class BoxSection(Strict):
+    """`[[safety.workspace]]`: a box along the axes of the base frame."""
+
+    lower_m: Vector3
+    upper_m: Vector3
+
+    @model_validator(mode="after")
+    def _is_a_box(self) -> BoxSection:
+        if not all(low < high for low, high in zip(self.lower_m, self.upper_m, strict=True)):
+            raise ValueError("each number of upper_m must be larger than that of lower_m")
+        return self
+
+
 class SafetySection(Strict):
     """`[safety]`"""
 
     force_limit_n: Annotated[float, Field(gt=0, le=500)] = 100.0
     speed_limit_m_per_s: Annotated[float, Field(gt=0, le=2)] = 0.25
     lease_ttl_s: Annotated[float, Field(ge=0.1, le=10)] = 2.0
+    client_lost: Annotated[
+        Literal["hold", "stop"],
+        Field(
+            description="what happens when the lease lapses in a motion: `hold` ends the motion and holds the arm, `stop` also "
+            "latches the stop and switches the drives off"
+        ),
+    ] = "hold"
     max_reading_age_s: Positive = 0.1
+    joint_limits_rad: Annotated[
+        tuple[tuple[float, float], ...],
+        Field(description="least and largest angle of each joint, inside the arm's own range; empty for that range"),
+    ] = ()
+    workspace: Annotated[
+        tuple[BoxSection, ...],
+        Field(max_length=20, description="boxes that the tool's tip may not leave; empty for no limit"),
+    ] = ()
+    allowed_places: Annotated[
+        tuple[str, ...],
+        Field(
+            max_length=100,
+            description="ports and hosts that devices may get while the cell runs, besides those of this file; * stands for "
+            "anything",
+        ),
+    ] = ()
 
 
 class WorkspaceSection(Strict):

@@ -48,12 +48,23 @@ class Kinematics:
     solver: Any
 
     @classmethod
-    def of(cls, capabilities: ArmCapabilities) -> Kinematics:
+    def of(cls, capabilities: ArmCapabilities, joint_limits_rad: Sequence[tuple[float, float]] = ()) -> Kinematics:
         """Build the kinematics from the arm's capabilities.
 
+        Args:
+            joint_limits_rad: least and largest angle of each joint, which narrow the arm's own range; empty for that range.
+
         Raises:
-            ConfigError: the arm has other than six or seven joints.
+            ConfigError: the arm has other than six or seven joints, or other than those in `joint_limits_rad`.
         """
+        own = list(zip(capabilities.lower_rad, capabilities.upper_rad, strict=True))
+        narrow = list(joint_limits_rad) or own
+        if len(narrow) != len(own) or any(max(a[0], b[0]) >= min(a[1], b[1]) for a, b in zip(own, narrow, strict=True)):
+            raise ConfigError(
+                f"safety.joint_limits_rad does not fit {capabilities.model!r} with its {len(own)} joints",
+                hint=f"give each joint a least and a larger angle within {own}",
+                key="safety.joint_limits_rad",
+            )
         dh = np.array([[link.d_m, link.a_m, link.alpha_rad, link.offset_rad] for link in capabilities.links])
         solver = DhRobot(dh[:SOLVED_JOINTS, 2], dh[:SOLVED_JOINTS, 1], dh[:SOLVED_JOINTS, 0])
         if len(dh) not in (SOLVED_JOINTS, SOLVED_JOINTS + 1):
@@ -61,8 +72,8 @@ class Kinematics:
         return cls(
             capabilities=capabilities,
             dh=dh,
-            lower_rad=np.array(capabilities.lower_rad),
-            upper_rad=np.array(capabilities.upper_rad),
+            lower_rad=np.array([max(a[0], b[0]) for a, b in zip(own, narrow, strict=True)]),
+            upper_rad=np.array([min(a[1], b[1]) for a, b in zip(own, narrow, strict=True)]),
             velocity_rad_per_s=np.array(capabilities.velocity_rad_per_s),
             acceleration_rad_per_s2=np.array(capabilities.acceleration_rad_per_s2),
             jerk_rad_per_s3=np.array(capabilities.acceleration_rad_per_s2) / RISE_S,

@@ -103,7 +103,7 @@ class Controller:
         self._touch_monitor = TouchMonitor(devices.touch, devices.force_torque)
         self._is_retreat = False  # whether the running motion goes on when a sensor fails
         capabilities = devices.arm.capabilities()
-        self.kinematics = Kinematics.of(capabilities)
+        self.kinematics = Kinematics.of(capabilities, safety.joint_limits_rad)
         self._clock = clock
         self._safety = safety
         self._contact = ContactWrench(load, flange_from_sensor)
@@ -223,7 +223,9 @@ class Controller:
             sample = self._read(is_tolerant=is_retreat(motion))
             self._standing.check_held(sample.position_rad, self._filter)
             check(motion, self.kinematics, sample.position_rad)
-            self._filter = SetPointLimiter(self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s)
+            self._filter = SetPointLimiter(
+                self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s, self._safety.workspace
+            )
             self._standing.resume(sample.position_rad, self._filter)
             run = self._begin(motion, sample)
         except DeviceFailure as failure:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
+from hal.config import BoxSection
 from hal.errors import MotionRefused
 from hal.geometry import difference
 from hal.motion import CartesianPath, DeclaredMotion, GripperMotion, Hold, JointTrajectory, Quantity
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control import braking
 from manipulation.control.sensing import DeviceFailure
+from manipulation.control.workspace import Workspace
 
 START_RAD = 0.05
 START_M = 0.005
@@ -24,12 +27,23 @@ LOOK_BACK_TICKS = 3  # with one, a jitter of 10 % in the ticks triples the follo
 
 
 class SetPointLimiter:
-    """Keeps set-points finite and within joint range, speed, acceleration and tip speed; keeps the one sent last."""
+    """Keeps set-points finite and within joint range, speed, acceleration, tip speed and workspace.
 
-    def __init__(self, kinematics: Kinematics, flange_from_tool: Array, tip_limit_m_per_s: float, dt_s: float) -> None:
+    It also keeps the set-point that was sent last.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        flange_from_tool: Array,
+        tip_limit_m_per_s: float,
+        dt_s: float,
+        workspace: Sequence[BoxSection] = (),
+    ) -> None:
         self._kinematics = kinematics
         self._tool = flange_from_tool
         self._tip_limit = tip_limit_m_per_s
+        self._workspace = Workspace(workspace, kinematics, flange_from_tool, dt_s)
         self._dt_s = dt_s
         self._wanted_rad = np.zeros((LOOK_BACK_TICKS, len(kinematics.dh)))  # newest first
         self.last_rad = np.zeros(len(kinematics.dh))
@@ -45,10 +59,15 @@ class SetPointLimiter:
         """Return the set-point that may be sent.
 
         Raises:
-            DeviceFailure: the wanted set-point is not finite.
+            DeviceFailure: the wanted set-point is not finite, or the tip would leave the workspace.
         """
         if not math.isfinite(wanted_rad @ wanted_rad):
             raise DeviceFailure("controller", "a set-point was not finite")
+        out = self._step(wanted_rad)
+        self._workspace.check(self.last_rad, out)
+        return out
+
+    def _step(self, wanted_rad: Array) -> Array:
         kin = self._kinematics
         out: Array = braking.safe_step(
             kin.dh, self._tool, wanted_rad, self._wanted_rad, self.last_rad, self.velocity_rad_per_s,
@@ -62,7 +81,7 @@ class SetPointLimiter:
     def brake(self) -> Array:
         """Return the set-point of a tick that only slows down, each joint as fast as its limit allows."""
         self._wanted_rad[:] = self.last_rad
-        return self.apply(self.last_rad)
+        return self._step(self.last_rad)
 
     def sent(self, position_rad: Array) -> None:
         """Note the set-point that the arm reports as sent to its drives."""

@@ -42,10 +42,10 @@ class Shared:
         """Return the resource under `key`, or None."""
         return self._resources.get(key)
 
-    def lost(self) -> str | None:
+    def why_ended(self) -> str | None:
         """Return why a resource has ended for good, such as the process of a world; None while all of them live."""
         for resource in list(self._resources.values()):
-            look: Callable[[], str | None] | None = getattr(resource, "lost", None)
+            look: Callable[[], str | None] | None = getattr(resource, "why_ended", None)
             if look is not None and (why := look()) is not None:
                 return why
         return None

@@ -262,9 +262,9 @@ class WorldClient:
         with self._lock:
             return self._link.ask(op, *arguments)
 
-    def lost(self) -> str | None:
-        """Return how the world process was lost, or None; see `WorldLink.lost`."""
-        return self._link.lost()
+    def why_ended(self) -> str | None:
+        """Return how the world process was lost, or None; see `WorldLink.why_ended`."""
+        return self._link.why_ended()
 
     def close(self) -> None:
         """End the world; a second call does nothing."""

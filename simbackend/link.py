@@ -87,7 +87,7 @@ class WorldLink:
             info = self.ask(Op.RENDER, *arguments)
             return info, np.frombuffer(self._images, np.float32, int(np.prod(shape))).reshape(shape).copy()
 
-    def lost(self) -> str | None:
+    def why_ended(self) -> str | None:
         """Return how the process was lost, as in "the simulated world has ended"; None while it lives or is closed.
 
         It is lost when it has ended, when it has been suspended for a second, and when it does not answer for 20 s.

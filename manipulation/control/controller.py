@@ -291,9 +291,9 @@ class Controller:
                     continue
             except DeviceFailure as failure:
                 end = Termination(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
+            self._come_to_rest(end)  # first, because a gripper that hangs must not keep the arm from its rest
             if run.pads is not None:
-                run.pads.halt(sample, elapsed_s)
-            self._come_to_rest(end)
+                run.pads.halt(self._newest or sample, elapsed_s)
             return end
 
     def _come_to_rest(self, end: Termination) -> None:

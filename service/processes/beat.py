@@ -16,7 +16,7 @@ from hal.process_state import ProcessState, process_state
 
 PERIOD_S = 0.02
 LOOK_S = 0.06  # an older heartbeat makes the reader ask the operating system for the state of the process
-SILENCE_S = 2.0  # a process that runs may be this late: a compiler can hold Python's lock for about a second
+SILENCE_S = 4.0  # a process that runs may be this late: a compiler can hold the lock of Python for seconds
 SIZE = 16
 NAMES = ("service", "cell", "stop")
 

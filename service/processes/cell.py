@@ -55,13 +55,13 @@ log = logging.getLogger(__name__)
 class CellRuntime:
     """A running cell; `objects` maps names to the objects that are served: devices, the mover and the clock.
 
-    `lost` returns why the cell must be started again, for example because its world has ended; None while it can go on.
+    `why_ended` returns why the cell must be started again, for example because its world has ended; None while it can go on.
     """
 
     cell: Cell
     clock: Clock
     objects: Mapping[str, Any]
-    lost: Callable[[], str | None] = lambda: None
+    why_ended: Callable[[], str | None] = lambda: None
     _closers: list[Callable[[], None]] = field(default_factory=list)
 
     @classmethod
@@ -124,7 +124,7 @@ class CellRuntime:
         except BaseException:
             _close_all(closers)
             raise
-        return cls(cell=cell, clock=clock, objects=objects, lost=shared.lost, _closers=closers)
+        return cls(cell=cell, clock=clock, objects=objects, why_ended=shared.why_ended, _closers=closers)
 
     def close(self) -> None:
         """Stop the arm, then close devices, emulators and world even if some of them fail. Idempotent."""
@@ -293,7 +293,7 @@ def _run(
     )
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     freeze_loaded()
-    vigil.watch(runtime.lost)
+    vigil.watch(runtime.why_ended)
     lifeline.write_line("ready")
     end.wait()
     vigil.watch(lambda: None)  # from now on the world may end

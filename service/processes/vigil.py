@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 from service.processes.beat import PERIOD_S, Beat
 from service.processes.cell_lines import LOST, note_to_line
 from service.processes.child import Lifeline, kill_own_group
+
+log = logging.getLogger(__name__)
 
 
 class Vigil:
@@ -33,7 +36,11 @@ class Vigil:
         """Give heartbeats and watch, endlessly."""
         pause = threading.Event()
         while True:
-            self.look()
+            try:
+                self.look()
+            except Exception:  # a defect of a resource must not look like a cell that hangs
+                log.exception("watching the resources of the cell")
+                self._lost = lambda: None
             pause.wait(PERIOD_S)
 
     def look(self) -> None:

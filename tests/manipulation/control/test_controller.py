@@ -20,7 +20,7 @@ from hal.motion import (
     Quantity,
 )
 from manipulation.planning.cartesian_path import line
-from tests.manipulation.rig import GRIP, HOME, LOAD, Rig, make_rig, tool_pose
+from tests.manipulation.rig import GRIP, HOME, LOAD, FakeGripper, Rig, make_rig, tool_pose
 
 INF = float("inf")
 
@@ -276,6 +276,30 @@ def test_the_pads_move_during_a_trajectory_and_both_arrive(rig: Rig, last: str) 
     assert report.gripper_width_m == pytest.approx(0.01, abs=1e-4)
     assert np.abs(report.position_rad - goal).max() < 1e-3
     assert (report.duration_s > motion.times_s[-1] + 0.1) == (last == "pads")
+
+
+def test_the_arm_is_at_rest_and_its_drives_are_off_before_a_gripper_that_may_hang_is_asked_to_stop(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[bool, float]] = []
+
+    def command(_gripper: FakeGripper, *, width_m: float, **_given: object) -> float:
+        asked.append((rig.world.enabled, float(np.abs(rig.world.velocity).max())))
+        return width_m
+
+    monkeypatch.setattr(FakeGripper, "command", command)
+    begun = rig.world.ticks
+
+    def stop() -> None:
+        rig.latched[0] = rig.world.ticks - begun >= 100
+
+    rig.world.before_step = stop
+    pads = GripperMotion(name="close", width_m=0.01, force_n=10.0)
+    motion = replace(joints(HOME + 0.2, duration_s=1.5), pads=pads)
+    assert rig.controller.execute(motion).outcome is MotionOutcome.STOPPED
+    assert len(asked) == 2, "it was asked to close, then to stop"
+    is_on, fastest = asked[1]
+    assert (is_on, fastest < 1e-3) == (False, True)
 
 
 @pytest.mark.parametrize("ticks", [0, 3, 100])

@@ -89,7 +89,7 @@ class FakeDevice:
             self._child.kill()
             self._child.wait()
 
-    def lost(self) -> str | None:
+    def why_ended(self) -> str | None:
         ended = not self._closed and self._child is not None and self._child.poll() is not None
         return "the fake world has ended" if ended else None
 

@@ -32,7 +32,9 @@ from tests.service.waiting import eventually
 
 SENSOR = "/v1/devices/finger_proximity"
 CAMERA = "/v1/devices/wrist_camera"
-WIRES = '[safety]\nallowed_places = ["/dev/pts/*", "/*/panelwright-*"]'  # where the emulators of the tests are
+WIRES = (
+    '[safety]\nallowed_places = ["/dev/gone", "/dev/pts/*", "/*/panelwright-*"]'  # where the emulators of the tests are
+)
 SOON = Deadline.after(WallClock(), 3600.0)
 
 
@@ -51,7 +53,8 @@ def http(sensors: Panelwright) -> Iterator[httpx2.Client]:
     """Yield a client; each test begins with the fakes as drivers."""
     with httpx2.Client(base_url=sensors.url, timeout=30.0, trust_env=False) as http:
         for name, kind in (("finger_proximity", "proximity"), ("panel_lights", "lights")):
-            assert http.put(f"/v1/devices/{name}", json={"driver": f"fake:{kind}"}).status_code == 200
+            answer = http.put(f"/v1/devices/{name}", json={"driver": f"fake:{kind}"})
+            assert answer.status_code == 200, answer.text
         yield http
 
 

@@ -232,7 +232,7 @@ def test_a_failed_commit_reaches_its_caller_and_the_chain_goes_on(tmp_path: Path
         db.execute("DROP TRIGGER full")
     journal.append("good again", {})
     assert [record.kind for record in journal.records()] == ["good", "stop", "journal-failed", "good again"]
-    assert journal.verify() == 3
+    assert journal.verify() == 4
     journal.close()
 
 

@@ -15,6 +15,7 @@ from hal.errors import ConfigError, DeviceTimeout, DeviceUnavailable
 from hal.readings import Quality, Stamped
 from hal.simulated import Fault, FaultInjection
 from simbackend.wire import REQUEST, Op
+from tests.service.waiting import eventually
 from tests.simbackend.rig import SimCell
 
 READS: dict[str, Callable[[Any, Any], Stamped[Any]]] = {
@@ -148,8 +149,14 @@ def test_a_dead_world_is_an_unavailable_device() -> None:
         arm = cell.connect("arm")
         world = cell.shared.peek("world")
         assert world is not None
+        assert cell.shared.why_ended() is None
+        world._link.process.send_signal(signal.SIGSTOP)
+        assert "suspended" in str(eventually(cell.shared.why_ended))
+        world._link.process.send_signal(signal.SIGCONT)
+        eventually(lambda: cell.shared.why_ended() is None)
         world._link.process.kill()
         world._link.process.wait(60.0)
+        assert "has ended" in str(cell.shared.why_ended())
         with pytest.raises(DeviceUnavailable) as caught:
             cell.clock.sleep(0.1)
         assert "world" in str(caught.value)

@@ -28,7 +28,7 @@ def latch(tmp_path: Path) -> Iterator[Latch]:
 
 @pytest.fixture
 def host(latch: Latch, tmp_path: Path) -> Iterator[ProcessStop]:
-    host = ProcessStop(latch, tmp_path / "latch", None, (), report=lambda _kind, _data: None)
+    host = ProcessStop(latch, tmp_path, None, (), report=lambda _kind, _data: None)
     yield host
     os.kill(_pid(host), signal.SIGCONT)
     host.close()
@@ -75,7 +75,7 @@ def test_a_reset_that_is_obeyed_too_late_clears_nothing_for_a_moment(
 
 def test_a_stop_process_without_its_supervisor_latches_and_ends(latch: Latch, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        arguments = ["--fd", str(listener.fileno()), "--latch", str(tmp_path / "latch")]
+        arguments = ["--fd", str(listener.fileno()), "--folder", str(tmp_path)]
         process = subprocess.Popen(
             module_command("service.processes.stop", *arguments),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[listener.fileno()],

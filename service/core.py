@@ -39,6 +39,7 @@ from service.tasks.journal_watch import JournalWatch
 from service.tasks.lease import Command, LeaseDesk
 from service.tasks.model import Task, TaskState
 from service.tasks.store import TaskContext, TaskStore
+from service.tasks.sub_leases import SubLease
 from service.world_model import WorldModel
 
 if TYPE_CHECKING:
@@ -171,34 +172,44 @@ class Service:
         if moves and latch.is_latched:
             raise stopped(latch.source)
         observe = partial(self.observations.of_task, verb=verb, asked_by=actor() or holder or "")
+        asked = request.model_dump(mode="json")
         sub = self.lease.lend(is_own=is_followed and holder is None) if moves else None
+        work = self._work(operation, request, command=command, observe=observe, sub=sub, stops_seen=latch.count)
+        task = self.tasks.start(verb, asked, work, moves=moves, holder=holder, key=key, sub_lease=sub, client=client)
+        if moves:
+            self._confirm(task, command.token)
+        return task
+
+    def _work(
+        self,
+        operation: Operation,
+        request: BaseModel,
+        *,
+        command: Command,
+        observe: Callable[..., Any],
+        sub: SubLease | None,
+        stops_seen: int,
+    ) -> Callable[[TaskContext], Any]:
+        """Return the work of a task, which moves nothing after a stop that is newer than `stops_seen`."""
 
         def work(task: TaskContext) -> Any:
             def check_may_move() -> None:
                 task.check_cancelled()
-                self._check_not_stopped_since(latch.count)
+                self._check_not_stopped_since(stops_seen)
                 if sub is not None:
                     sub.check()
 
             self.lease.check_in_time(command)  # again, because it may have waited in the queue
-            connection = GatedConnection(
-                self.supervisor.connection,
-                check_may_move,
-                cell=self.calibrations.applied(),
-                stop=self.supervisor.stop,
-            )
+            cell, stop = self.calibrations.applied(), self.supervisor.stop
+            connection = GatedConnection(self.supervisor.connection, check_may_move, cell=cell, stop=stop)
             observer = observe(task=task.id, cell_now_s=connection.clock.now_s)
             context = OperationContext(
                 connection=connection, task=task, runs_dir=self.runs_dir, world=self.world, observer=observer
             )
-            with calling_as(f"{verb} {task.id}"):
+            with calling_as(f"{operation.name} {task.id}"):
                 return operation.run(context, request)
 
-        plain = request.model_dump(mode="json")
-        task = self.tasks.start(verb, plain, work, moves=moves, holder=holder, key=key, sub_lease=sub, client=client)
-        if moves:
-            self._confirm(task, command.token)
-        return task
+        return work
 
     def _admit(self, command: Command, key: str | None) -> str | None:
         """Ask the lease, and return its holder; the number of a command that is repeated with its key counts once."""

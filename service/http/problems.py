@@ -126,36 +126,11 @@ class TooManyUploads(Exception):
 def install(app: FastAPI, *, paths: Sequence[str]) -> None:
     """Register the handlers; `paths` are all known paths, from which the hint for a mistyped one is chosen."""
 
+    _install_for_bodies(app)
+
     @app.exception_handler(CellError)
     async def _cell_error(_request: Request, error: CellError) -> Response:
         return error_response(error)
-
-    @app.exception_handler(BadBody)
-    async def _bad_body(_request: Request, error: BadBody) -> Response:
-        return problem_response(error.status, "bad-body", error.what, hint=error.hint, faults=error.faults)
-
-    @app.exception_handler(BodyTooLarge)
-    async def _too_large(_request: Request, _error: BodyTooLarge) -> Response:
-        return problem_response(
-            413, "body-too-large", "the body is too large", hint="send less than 1 MB, an image less than 32 MB"
-        )
-
-    @app.exception_handler(ClientDisconnect)
-    async def _gone(_request: Request, _error: ClientDisconnect) -> Response:
-        # Nobody reads this answer; without a handler the log would report a defect.
-        return problem_response(
-            400, "body-cut-off", "the client left before its body was complete", hint="send it again"
-        )
-
-    @app.exception_handler(BodyTimeout)
-    async def _too_slow(_request: Request, _error: BodyTimeout) -> Response:
-        what, close = "the body did not come in time", {"Connection": "close"}
-        return problem_response(408, "body-timeout", what, hint="send it again", retry=Retry.SAFE, headers=close)
-
-    @app.exception_handler(TooManyUploads)
-    async def _too_many(_request: Request, _error: TooManyUploads) -> Response:
-        what, later = "too much is being sent at the same time", {"Connection": "close", "Retry-After": "5"}
-        return problem_response(503, "busy", what, hint="send it again later", retry=Retry.SAFE, headers=later)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_request: Request, error: RequestValidationError) -> Response:
@@ -191,6 +166,37 @@ def install(app: FastAPI, *, paths: Sequence[str]) -> None:
         log.error("%s %s failed by a defect", request.method, request.url.path, exc_info=error)
         what = f"the service has a defect: {type(error).__name__}"
         return problem_response(500, "defect", what, hint="the log has more; please report it", retry=Retry.NEVER)
+
+
+def _install_for_bodies(app: FastAPI) -> None:
+    """Register the handlers of faults of a request's body."""
+
+    @app.exception_handler(BadBody)
+    async def _bad_body(_request: Request, error: BadBody) -> Response:
+        return problem_response(error.status, "bad-body", error.what, hint=error.hint, faults=error.faults)
+
+    @app.exception_handler(BodyTooLarge)
+    async def _too_large(_request: Request, _error: BodyTooLarge) -> Response:
+        return problem_response(
+            413, "body-too-large", "the body is too large", hint="send less than 1 MB, an image less than 32 MB"
+        )
+
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(_request: Request, _error: ClientDisconnect) -> Response:
+        # Nobody reads this answer; without a handler the log would report a defect.
+        return problem_response(
+            400, "body-cut-off", "the client left before its body was complete", hint="send it again"
+        )
+
+    @app.exception_handler(BodyTimeout)
+    async def _too_slow(_request: Request, _error: BodyTimeout) -> Response:
+        what, close = "the body did not come in time", {"Connection": "close"}
+        return problem_response(408, "body-timeout", what, hint="send it again", retry=Retry.SAFE, headers=close)
+
+    @app.exception_handler(TooManyUploads)
+    async def _too_many(_request: Request, _error: TooManyUploads) -> Response:
+        what, later = "too much is being sent at the same time", {"Connection": "close", "Retry-After": "5"}
+        return problem_response(503, "busy", what, hint="send it again later", retry=Retry.SAFE, headers=later)
 
 
 def _near(asked: str, paths: Sequence[str]) -> str:

@@ -146,7 +146,8 @@ def _latch(folder: Path) -> Latch:
 
 
 def _stop(latch: Latch, chunks: Sequence[bytes]) -> object:
-    return StopServer(latch).answer(b"".join(chunks), "127.0.0.1")
+    server, head = StopServer(latch), b"".join(chunks)
+    return server.answer(head, server.begin(head.partition(b"\n")[0], "127.0.0.1"))
 
 
 def _file(load: Callable[[Path], object], path: Path, chunks: Sequence[bytes]) -> object:

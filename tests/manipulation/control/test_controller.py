@@ -285,6 +285,7 @@ def test_the_arm_is_at_rest_and_its_drives_are_off_before_a_gripper_that_may_han
 
     def command(_gripper: FakeGripper, *, width_m: float, **_given: object) -> float:
         asked.append((rig.world.enabled, float(np.abs(rig.world.velocity).max())))
+        rig.world.width_target_m = width_m
         return width_m
 
     monkeypatch.setattr(FakeGripper, "command", command)

@@ -11,6 +11,7 @@ import pytest
 
 from hal.errors import CellError
 from service.errors import Busy
+from service.http.load import Load
 from service.serve import Panelwright
 from tests.service.verbs import HoldRequest
 from tests.service.waiting import eventually
@@ -108,17 +109,23 @@ def test_one_client_cannot_fill_the_queue_of_all(served: Panelwright, client: ht
 def test_too_many_requests_of_one_client_are_refused_but_stop_and_health_are_not(
     served: Panelwright, client: httpx2.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("service.http.load.MAX_REQUESTS_OF_CLIENT", 0)
+    refused = client.get("/v1/tasks")
+    assert (refused.status_code, refused.json()["type"]) == (503, "urn:panelwright:busy")
+    assert refused.headers["Retry-After"] == "1"
+    assert client.get("/healthz").status_code == 200
+    assert client.get("/readyz").status_code == 200
+    assert client.post("/v1/stop").status_code == 200
+
+
+def test_requests_in_work_are_counted_by_client_and_overall(monkeypatch: pytest.MonkeyPatch) -> None:
+    load = Load()
     monkeypatch.setattr("service.http.load.MAX_REQUESTS_OF_CLIENT", 2)
-    with connected(served) as one, connected(served) as other:
-        for link in (one, other):
-            link.sendall(UPLOAD + b"x")
-        refused = eventually(lambda: _refused(client))
-        assert refused.json()["type"] == "urn:panelwright:busy"
-        assert refused.headers["Retry-After"] == "1"
-        assert client.get("/healthz").status_code == 200
-        assert client.post("/v1/stop").status_code == 200
-
-
-def _refused(client: httpx2.Client) -> httpx2.Response | None:
-    answer = client.get("/v1/tasks")
-    return answer if answer.status_code == 503 else None
+    monkeypatch.setattr("service.http.load.MAX_REQUESTS", 3)
+    with load.request("a"), load.request("a"):
+        assert "of your machine" in str(load.refusal("/v1/tasks", "a"))
+        assert load.refusal("/v1/tasks", "b") is None
+        with load.request("b"):
+            assert "3 requests are in work" in str(load.refusal("/v1/tasks", "c"))
+            assert load.refusal("/v1/stop", "a") is None
+    assert load.refusal("/v1/tasks", "a") is None

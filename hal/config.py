@@ -150,8 +150,8 @@ class WorkspaceSection(Strict):
     park_rad: tuple[float, ...]
     floor_z_m: float = 0.0
     to_measure: Annotated[
-        tuple[Literal["panel_position_m", "panel_rpy_rad", "park_rad", "floor_z_m"], ...],
-        Field(description="keys of this table that are still guesses"),
+        tuple[Literal["panel_position_m", "panel_rpy_rad", "park_rad", "floor_z_m", "kinematics"], ...],
+        Field(description="keys of this table, or `kinematics` of the arm's options, that are still guesses"),
     ] = ()
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from perception.calibration.scanner import ScannerCalibration, ScannerView, calibrate_scanner
     from perception.calibration.tip import calibrate_tip
     from perception.calibration.wrench import WrenchCalibration, calibrate_wrench
+    from perception.calibration.zero import calibrate_zero
 
 __all__ = [
     "UNKNOWN_LENS",
@@ -36,6 +37,7 @@ __all__ = [
     "calibrate_scanner",
     "calibrate_tip",
     "calibrate_wrench",
+    "calibrate_zero",
     "propose_view",
     "record_of",
     "renewed",

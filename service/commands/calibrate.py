@@ -18,6 +18,7 @@ from service.commands.board import board
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
 from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
 from service.commands.tip import tip
+from service.commands.zero import zero
 
 app = typer.Typer(
     help="Calibrate: the arm drives through poses, measures, and stores a versioned, dated record with its quality.",
@@ -25,6 +26,7 @@ app = typer.Typer(
 )
 app.command()(board)
 app.command()(tip)
+app.command()(zero)
 Poses = Annotated[int, typer.Option(min=4, max=40, help="Number of stations to measure from.")]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only plan the stations; nothing moves and nothing is written.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -13,13 +13,14 @@ from hal.errors import InvalidRequest
 from service.commands.common import DEFAULT_CELL, console
 
 if TYPE_CHECKING:
+    from service.commissioning.real_arms import ArmName
     from service.commissioning.real_cell import RealCell
 
 ASKED = "Real cells: asked for if not given; "
-ARMS = ("ur10e",)
+ARMS = ("ur10e", "cia402", "dynamixel", "ros2")
 QUESTIONS = {
-    "arm_address": "address of the arm's controller",
-    "gripper_port": "serial port of the gripper",
+    "arm_address": "address of the arm's controller, or its CAN channel or serial port",
+    "gripper_port": "serial port of a gripper with a port of its own",
     "camera": "driver of the camera",
     "camera_device": "what that driver opens",
     "wrench_port": "serial port of the force/torque sensor (none: -)",
@@ -67,16 +68,19 @@ def init(
         "find_by": find_by,
         "plate": plate,
     }
-    _write(_answered(given, name, is_asking=sys.stdin.isatty() if ask is None else ask), folder)
+    _write(_answered(cast("ArmName", cell), given, name, is_asking=sys.stdin.isatty() if ask is None else ask), folder)
 
 
-def _answered(given: dict[str, str | None], name: str | None, *, is_asking: bool) -> RealCell:
+def _answered(arm: ArmName, given: dict[str, str | None], name: str | None, *, is_asking: bool) -> RealCell:
     """Return the answers, with questions for those that are missing, or else their usual values."""
+    from service.commissioning.real_arms import ARMS as KNOWN
     from service.commissioning.real_cell import RealCell
 
-    usual = RealCell()
-    answers: dict[str, Any] = {} if name is None else {"name": name}
+    usual = RealCell.usual(arm)
+    answers: dict[str, Any] = {"arm": arm, "name": name or usual.name}
     for key, words in QUESTIONS.items():
+        if key == "gripper_port" and KNOWN[arm].shares_link:
+            continue
         default = f"{usual.plate_m[0]:g}x{usual.plate_m[1]:g}" if key == "plate" else str(getattr(usual, key))
         if key == "io_address" and answers.get("find_by", given["find_by"]) in ("tags", "outline"):
             default = "-"  # nothing else needs it

@@ -28,7 +28,7 @@ def tip(
     from perception.calibration import calibrate_tip, renewed, to_toml
 
     present = load_calibration(out)
-    rows = _rows(poses)
+    rows = rows_of(poses, columns=6, hint="X Y Z in metres, RX RY RZ in rad")
     flanges = [RigidTransform.from_components(row[:3], Rotation.from_rotvec(row[3:])) for row in rows]
     found = calibrate_tip(flanges)
     x, y, z = (float(v) for v in found.flange_from_tip_m)
@@ -55,8 +55,12 @@ def tip(
     console.print(f"wrote {out}, version {record.version}", markup=False)
 
 
-def _rows(path: Path) -> list[list[float]]:
-    """Return six numbers per line; empty lines and lines that begin with # are left out.
+def rows_of(path: Path, *, columns: int, hint: str) -> list[list[float]]:
+    """Return the numbers of each line; empty lines and lines that begin with # are left out.
+
+    Args:
+        columns: numbers of a line, the first three in metres, at most 20.
+        hint: what a line should have.
 
     Raises:
         InvalidRequest: a line has something else.
@@ -70,9 +74,9 @@ def _rows(path: Path) -> list[list[float]]:
             row = [float(word) for word in words]
         except ValueError:
             row = []
-        if len(row) != 6 or not np.isfinite(row).all() or max(abs(value) for value in row[:3]) > 20.0:
+        if len(row) != columns or not np.isfinite(row).all() or max(abs(value) for value in row[:3]) > 20.0:
             raise InvalidRequest(
-                f"{path}, line {number}: {line.strip()!r} is no pose", hint="X Y Z in metres, RX RY RZ in rad"
+                f"{path}, line {number}: {line.strip()!r} has not {columns} plausible numbers", hint=hint
             )
         rows.append(row)
     return rows

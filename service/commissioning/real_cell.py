@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from hal.errors import ConfigError, InvalidRequest
 from hal.toml_text import toml_text
+from service.commissioning.real_arms import ARMS, ArmName
 
 FindBy = Literal["lights", "tags", "outline"]
 TAG_M, CORNER_M = 0.040, 0.040  # side of a tag, and distance of lights and tags from the plate's edges
@@ -24,21 +25,22 @@ CAMERA_PX = (1280, 720)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RealCell:
-    """The answers that describe a real cell with a UR arm and a Robotiq gripper.
+    """The answers that describe a real cell.
 
     Attributes:
+        arm: one of `ARMS`.
         name: of the cell and its files.
-        arm: model of the arm; only its kinematics depend on it.
-        arm_address: host name or address of the arm's controller.
-        gripper_port, wrench_port: serial ports by a stable name; no wrench sensor if that is empty.
+        arm_address: host name or address of the arm's controller, its CAN channel or its serial port.
+        gripper_port, wrench_port: serial ports by a stable name; no wrench sensor if that is empty. A gripper on the
+            link of the arm needs no port.
         camera, camera_device: driver of the camera, and what that driver opens.
         io_address: host of the Modbus I/O that switches the lights; no lights if it is empty.
         find_by: what shows where the panel is.
         plate_m: width and height of the panel's plate.
     """
 
+    arm: ArmName = "ur10e"
     name: str = "real_ur10e"
-    arm: Literal["ur10e"] = "ur10e"
     arm_address: str = "192.168.0.10"
     gripper_port: str = "/dev/serial/by-id/usb-gripper"
     camera: str = "v4l2:camera"
@@ -47,6 +49,11 @@ class RealCell:
     io_address: str = "192.168.0.20"
     find_by: FindBy = "lights"
     plate_m: tuple[float, float] = (0.62, 0.46)
+
+    @classmethod
+    def usual(cls, arm: ArmName) -> RealCell:
+        """Return the usual answers for an arm."""
+        return cls(arm=arm, name=f"real_{arm}", arm_address=ARMS[arm].usual_address)
 
     def __post_init__(self) -> None:
         if self.find_by == "lights" and not self.io_address:
@@ -166,14 +173,16 @@ def _records(cell: RealCell) -> dict[str, Mapping[str, Any]]:
 
 
 def _cell_text(cell: RealCell, stem: str) -> str:
+    arm = ARMS[cell.arm]
+    is_ur = cell.arm == "ur10e"
     parts = [
-        HEAD.format(name=cell.name, stem=stem),
-        ARM.format(address=cell.arm_address),
-        GRIPPER.format(port=cell.gripper_port),
+        HEAD.format(name=cell.name, stem=stem, rate_hz=arm.rate_hz),
+        *([ARM.format(address=cell.arm_address), GRIPPER.format(port=cell.gripper_port)] if is_ur else []),
+        *([] if is_ur else [arm.sections(address=cell.arm_address, gripper_port=cell.gripper_port)]),
         _camera_text(cell),
         WRENCH.format(port=cell.wrench_port) if cell.wrench_port else NO_WRENCH,
         LIGHTS.format(address=cell.io_address) if cell.find_by == "lights" else NO_LIGHTS.format(way=cell.find_by),
-        REST,
+        REST.format(workspace=arm.workspace),
     ]
     return "\n".join(parts)
 
@@ -195,7 +204,7 @@ name = "{name}"
 mode = "real"
 panel = "panels/{stem}.toml"
 calibrations = "cells/{stem}"
-control_rate_hz = 500.0
+control_rate_hz = {rate_hz:.1f}
 """
 ARM = """\
 # A UR10e in remote control, with the payload set on the pendant. Its kinematics are the nominal ones of that model.
@@ -243,14 +252,7 @@ NO_LIGHTS = """\
 """
 REST = """\
 # Where the panel stands: its middle in the arm's base frame, within the tolerances. Its z axis points to the arm.
-[workspace]
-panel_position_m = [1.10, 0.0, 0.35]
-panel_rpy_rad = [1.5707963, 0.0, -1.5707963]
-position_tolerance_m = 0.10
-angle_tolerance_rad = 0.27
-park_rad = [0.4238, -1.7576, -2.4584, 1.0745, 1.1470, 0.0]
-floor_z_m = -0.6
-to_measure = ["panel_position_m", "panel_rpy_rad", "park_rad", "floor_z_m"]
+{workspace}
 
 # The first motions run at a tenth of the usual 0.25 m/s. Raise it when the arm goes where it should.
 [safety]

@@ -8,6 +8,10 @@ from dataclasses import dataclass
 from hal.config import Cell
 from hal.devices import DeviceKind
 
+WORKSPACE_HOW = {
+    "floor_z_m": "a ruler, from the arm's foot",
+    "kinematics": "the maker's table of Denavit-Hartenberg parameters, limits and zero positions",
+}
 PANEL_HOW = {
     "lights": "measure the four lamps' centres from the plate's edges with a caliper",
     "tags": "measure the middle and the side of each black square from the plate's edges with a caliper",
@@ -20,7 +24,7 @@ HOW = {
     (DeviceKind.FORCE_TORQUE, "load"): "`panelwright calibrate tool`",
     (DeviceKind.FORCE_TORQUE, "mount"): "the drawing of the adapter: sensor axes in the flange frame",
     (DeviceKind.GRIPPER, "mount"): "touch one point from four sides, then `panelwright calibrate tip`",
-    (DeviceKind.PROXIMITY, "mount"): "a ruler, then the zero against a plate at three distances",
+    (DeviceKind.PROXIMITY, "mount"): "a ruler, then `panelwright calibrate zero` with gauge blocks",
 }
 
 
@@ -37,8 +41,8 @@ def to_measure(cell: Cell) -> Iterator[ToMeasure]:
     """Yield everything that the files of the cell list as not measured."""
     file = cell.path.name
     for key in cell.file.workspace.to_measure:
-        how = "jog the arm, read the pendant" if key != "floor_z_m" else "a ruler, from the arm's foot"
-        yield ToMeasure(where=file, what=f"workspace.{key}", how=how)
+        what = "devices.arm.options.kinematics" if key == "kinematics" else f"workspace.{key}"
+        yield ToMeasure(where=file, what=what, how=WORKSPACE_HOW.get(key, "jog the arm, read the pendant"))
     for part in cell.panel.to_measure:
         yield ToMeasure(where=cell.file.cell.panel, what=part, how=PANEL_HOW.get(part, "a ruler or a caliper"))
     for device, section in cell.file.devices.items():

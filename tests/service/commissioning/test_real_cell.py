@@ -15,6 +15,7 @@ from hal.errors import ConfigError, InvalidRequest
 from perception.calibration import renewed, to_toml
 from service.cli import _app
 from service.commissioning.preflight import check_machine
+from service.commissioning.real_arms import ARMS, ArmName
 from service.commissioning.real_cell import FindBy, RealCell, texts_of, write_real_cell
 from service.commissioning.to_measure import to_measure
 from service.terminal import ROOT
@@ -49,6 +50,23 @@ def test_a_cell_of_flags_is_written_and_the_doctor_lists_what_is_to_be_measured(
     monkeypatch.chdir(tmp_path)
     told = CliRunner().invoke(_app(), ["doctor", "--no-connect", "--cell", "cells/hall-3.toml", "--port", "0"])
     assert told.exit_code == 0, told.output
+
+
+@pytest.mark.parametrize("arm", ["cia402", "dynamixel", "ros2"])
+def test_the_cell_of_another_arm_is_written_with_its_own_driver_and_guesses(arm: ArmName, tmp_path: Path) -> None:
+    words = ["--cell", arm, "--name", "hall_4", "--arm-address", "can7", "--no-ask"]
+    done = CliRunner().invoke(_app(), ["init", str(tmp_path), *words])
+    assert done.exit_code == 0, done.output
+    cell, shipped = load_cell(tmp_path / "cells/hall-4.toml"), load_cell(ROOT / "cells" / ARMS[arm].shipped)
+    check_machine(cell)
+    assert cell.file.devices["arm"].driver == shipped.file.devices["arm"].driver
+    assert cell.file.devices["arm"].options[ARMS[arm].address] == "can7"
+    is_shared = cell.file.devices["gripper"].options.get(ARMS[arm].address) == "can7"
+    assert is_shared == ARMS[arm].shares_link
+    assert cell.file.cell.control_rate_hz == shipped.file.cell.control_rate_hz
+    assert cell.file.workspace.park_rad == shipped.file.workspace.park_rad
+    told = {guess.what for guess in to_measure(cell)}
+    assert told >= {"devices.arm.options.kinematics", "workspace.park_rad", "mount", "lights"}
 
 
 def test_questions_are_asked_one_by_one_and_enter_takes_the_usual_answer(tmp_path: Path) -> None:

@@ -58,7 +58,8 @@ class WorldLink:
         """Send the configuration; return the first snapshot."""
         try:
             self._pipe.send(config)
-            complaint = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
+            answer = self._pipe.recv() if self._pipe.poll(START_S) else f"no answer within {START_S:.0f} s"
+            complaint = complaint_of(answer)
             if complaint is None:
                 return read_exactly(self._stream, SNAPSHOT * DOUBLE)
         except (EOFError, OSError):
@@ -138,6 +139,19 @@ class WorldLink:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait(CLOSE_S)
+
+
+def complaint_of(answer: object) -> str | None:
+    """Return why a world cannot be used, by its answer to the configuration; None if it can.
+
+    A world answers with the lengths of its requests and snapshots. A vector of another length would shift every value
+    that follows it on the pipe.
+    """
+    if isinstance(answer, str):
+        return answer
+    if answer == (REQUEST, SNAPSHOT):
+        return None
+    return f"it has vectors of {answer} doubles, and this program of {(REQUEST, SNAPSHOT)}; are both of one version?"
 
 
 def _vector(op: Op, *arguments: float) -> bytes:

@@ -29,9 +29,10 @@ def serve(pipe: Connection, images: mmap.mmap) -> None:
     except Exception as error:  # whatever prevents a world from being built must reach the user who started it
         pipe.send(f"{type(error).__name__}: {error}")
         return
-    pipe.send(None)
+    first = world.snapshot()
+    pipe.send((REQUEST, len(first)))
     stream = pipe.fileno()
-    os.write(stream, world.snapshot().tobytes())
+    os.write(stream, first.tobytes())
     while True:
         try:
             message = read_exactly(stream, REQUEST * DOUBLE)

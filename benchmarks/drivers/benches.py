@@ -13,6 +13,7 @@ from benchmarks.drivers.ros2_benches import ROS2_BENCHES
 from benchmarks.drivers.truths import (
     MovingArm,
     TimedForceTorque,
+    TimedProximity,
     TimedTouch,
     is_near,
     scip_angles,
@@ -24,6 +25,7 @@ from benchmarks.drivers.truths import (
     true_express,
     true_joints,
     true_lights,
+    true_reading,
     true_scan,
     true_width,
     true_wrench,
@@ -61,9 +63,11 @@ BENCHES = (
     Bench(
         name="tfmini modbus",
         start=tfmini_i.start_modbus,
-        backing=scripted.ScriptedProximity,
+        backing=TimedProximity,
         driver="modbus:tfmini",
-        is_true=true_centimetres,
+        is_true=true_reading,
+        taken_s=taken_s,
+        stamps="taken",
     ),
     Bench(
         name="tfmini can",

@@ -58,6 +58,34 @@ class TimedForceTorque(scripted.ScriptedForceTorque):
         return self._read_s[-1 - ago]
 
 
+class TimedProximity(scripted.ScriptedProximity):
+    """Distance that rises by 1 cm per read, the resolution of some sensors, and the time of each of the last reads."""
+
+    KEPT = 1000
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._read_s: deque[float] = deque(maxlen=self.KEPT)
+
+    def read_distance_m(self, *, deadline: Deadline) -> Stamped[float]:
+        """Return the next distance."""
+        self._read_s.append(time.monotonic())
+        stamped = super().read_distance_m(deadline=deadline)
+        return replace(stamped, value=self.first_m + 0.01 * (self.reads % self.KEPT))
+
+    def _ago(self, value: float) -> int:
+        return (self.reads - round((value - self.first_m) / 0.01)) % self.KEPT
+
+    def is_true(self, value: float) -> bool:
+        """Return whether the value equals one of the last 100 readings."""
+        steps = (value - self.first_m) / 0.01
+        return abs(steps - round(steps)) < 1e-6 and self._ago(value) <= 100
+
+    def taken_s(self, value: float) -> float:
+        """Return when a value was read."""
+        return self._read_s[-1 - self._ago(value)]
+
+
 class TimedTouch(scripted.ScriptedTouch):
     """Touch pads whose four patterns follow each other, each for `STEP_S`."""
 
@@ -99,6 +127,11 @@ def true_centimetres(value: float, backing: Any) -> bool:
     """Return whether the value equals one of the last 100 readings, rounded to a centimetre."""
     true_m = backing.first_m + 0.001 * (np.arange(backing.reads - 100, backing.reads + 1) % 1000)
     return bool(np.min(np.abs(np.round(true_m, 2) - value)) < 1e-6)
+
+
+def true_reading(value: float, backing: TimedProximity) -> bool:
+    """Return whether the value equals one of the last 100 readings."""
+    return backing.is_true(value)
 
 
 def true_express(value: RangeImage, backing: Any) -> bool:

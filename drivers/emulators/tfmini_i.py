@@ -42,27 +42,23 @@ class CanTfminiIOptions(TfminiIOptions):
 
 
 class Measurement:
-    """Newest measurement, renewed `rate_hz` times per second: distance in cm, strength, sensor clock in ms."""
+    """Newest measurement: distance in cm, strength, and the sensor's clock in ms at the time of the measurement."""
 
     def __init__(self, backing: Proximity, options: TfminiIOptions) -> None:
         self._backing = backing
-        self._period_s = 1.0 / options.rate_hz
         self._clock_start_ms = options.clock_start_ms
         self._start_s = time.monotonic()
-        self._index = -1
-        self._newest = (0, WEAK, 0)
         self._clock = WallClock()
+        self.newest = (0, WEAK, options.clock_start_ms)
 
-    def newest(self) -> tuple[int, int, int]:
-        """Return distance (cm), strength and clock (ms) of the present period."""
-        index = int((time.monotonic() - self._start_s) / self._period_s)
-        if index != self._index:
-            self._index = index
-            sample = self._backing.read_distance_m(deadline=Deadline.after(self._clock, BACKING_S))
-            is_seen = sample.quality is not Quality.INVALID
-            stamp_ms = (self._clock_start_ms + round(index * self._period_s * 1000.0)) & 0xFFFFFFFF
-            self._newest = (round(sample.value * 100.0) if is_seen else 0, STRONG if is_seen else WEAK, stamp_ms)
-        return self._newest
+    def renew(self) -> tuple[int, int, int]:
+        """Measure, and return distance (cm), strength and clock (ms)."""
+        passed_ms = round((time.monotonic() - self._start_s) * 1000.0)
+        sample = self._backing.read_distance_m(deadline=Deadline.after(self._clock, BACKING_S))
+        is_seen = sample.quality is not Quality.INVALID
+        stamp_ms = (self._clock_start_ms + passed_ms) & 0xFFFFFFFF
+        self.newest = (round(sample.value * 100.0) if is_seen else 0, STRONG if is_seen else WEAK, stamp_ms)
+        return self.newest
 
 
 class TfminiITable(RegistersOnly):
@@ -73,7 +69,7 @@ class TfminiITable(RegistersOnly):
 
     def registers(self, address: int, count: int) -> Sequence[int]:
         """Return registers of measurement, clock and firmware version."""
-        raw, strength, stamp_ms = self._measurement.newest()
+        raw, strength, stamp_ms = self._measurement.newest
         words = (raw, strength, 0, stamp_ms >> 16, stamp_ms & 0xFFFF, 0, *FIRMWARE)
         if address + count > len(words):
             raise no_such(address, count)
@@ -83,6 +79,19 @@ class TfminiITable(RegistersOnly):
         """Accept save, restart, baud rate, unit and rate without effect."""
         if not ADDRESS_SAVE <= address <= ADDRESS_LAST_SETTING:
             raise no_such(address, *values)
+
+
+class ModbusTfminiEmulator(ModbusFarSide):
+    """Running emulator of the sensor on a serial bus; it measures at its own rate, and is asked for the newest result."""
+
+    def __init__(self, measurement: Measurement, options: TfminiIOptions) -> None:
+        super().__init__(PtyPort("tfmini"), options, TfminiITable(measurement), unit=UNIT, name="tfmini_modbus")
+        self._measurement = measurement
+        self.period_s = 1.0 / options.rate_hz
+
+    def on_tick(self) -> None:
+        """Measure."""
+        self._measurement.renew()
 
 
 class CanTfminiEmulator(WireEmulator):
@@ -112,11 +121,11 @@ class CanTfminiEmulator(WireEmulator):
     def on_tick(self) -> None:
         """Send one measurement while the channel is open."""
         if self.is_open:
-            self.send(None, self._frame(*self._measurement.newest()), protected=slice(0, 0))
+            self.send(None, self._frame(*self._measurement.renew()), protected=slice(0, 0))
 
     def status_frame(self) -> bytes | None:
         """Return a frame with too weak a signal."""
-        return self._frame(0, WEAK, self._measurement.newest()[2])
+        return self._frame(0, WEAK, self._measurement.newest[2])
 
     def _frame(self, raw: int, strength: int, stamp_ms: int) -> bytes:
         return self._lines.encode(CanFrame(CAN_ID, struct.pack("<HHI", raw, strength, stamp_ms)))
@@ -135,10 +144,9 @@ def _measurement(backing: Device, options: dict[str, Any], model: type[Options])
     return Measurement(backing, parsed), parsed
 
 
-def start_modbus(backing: Device, options: dict[str, Any]) -> ModbusFarSide:
+def start_modbus(backing: Device, options: dict[str, Any]) -> ModbusTfminiEmulator:
     """Start the Modbus emulator on a proximity device (entry point `tfmini_modbus`)."""
-    measurement, parsed = _measurement(backing, options, TfminiIOptions)
-    emulator = ModbusFarSide(PtyPort("tfmini"), parsed, TfminiITable(measurement), unit=UNIT, name="tfmini_modbus")
+    emulator = ModbusTfminiEmulator(*_measurement(backing, options, TfminiIOptions))
     emulator.begin()
     return emulator
 

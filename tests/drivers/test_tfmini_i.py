@@ -1,5 +1,6 @@
 """Tests of the TFmini-i: conformance over Modbus RTU and CAN, faults of both links, and third-party clients."""
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,7 +11,7 @@ from pymodbus.client import ModbusSerialClient
 
 from drivers.emulators import tfmini_i as emulator
 from drivers.emulators.scripted import ScriptedLights, ScriptedProximity
-from drivers.tfmini_i import CanTfmini, CanTfminiOptions, SensorClock
+from drivers.tfmini_i import CanTfmini, CanTfminiOptions, ModbusTfmini, ModbusTfminiOptions, SensorClock
 from drivers.transport.can_frames import CanFrame, record
 from hal.conformance import ProximityContract, Rig
 from hal.errors import Unsupported
@@ -69,6 +70,21 @@ def test_a_measurement_that_was_read_before_is_no_new_sample() -> None:
             device.newest(soon(0.02), not_before_s=first.host_time_s + 10.0)
     clock = SensorClock()
     assert [clock.is_new(stamp) for stamp in (5, 5, 6)] == [True, False, True]
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.003, 0.006, 0.009])
+def test_a_stamp_is_right_however_long_after_a_measurement_the_first_poll_comes(after_s: float) -> None:
+    options = ModbusTfminiOptions(port="/dev/null", baud=115_200)
+    device, clock = ModbusTfmini(Context(name="finger"), options), SensorClock()
+    worst_s, period_s = 0.0, 1.0 / options.rate_hz
+    for poll in range(200):
+        asked_s = 100.0 + after_s + poll * device.period_s
+        measured_s = math.floor(asked_s / period_s) * period_s
+        _, stamp_s = clock.times_s(round((measured_s - 99.0) * 1000.0), asked_s)
+        if poll >= 100:
+            worst_s = max(worst_s, abs(stamp_s - measured_s))
+    device.close()
+    assert worst_s < 0.001
 
 
 @pytest.mark.parametrize("order", ["little", "big"])

@@ -79,7 +79,12 @@ class CapsuleParser:
         while at + CAPSULE_BYTES <= len(data):
             capsule = data[at : at + CAPSULE_BYTES]
             if not is_capsule(capsule):
-                found += self._misstep() if self._before is not None else []
+                if (before := self._before) is not None and (begin := overlapping(before, data[at:])):
+                    found.append(None)
+                    self.missteps += 1
+                    self._before, data, at = None, before + data[at:], begin
+                    continue
+                found += self._misstep() if before is not None else []
                 at += 1
                 continue
             found += self._follow(capsule)
@@ -123,6 +128,17 @@ class CapsuleParser:
         if before is None or usual_rad is None:
             return [None]
         return [decode_capsule(before, start_rad(before) + usual_rad), None]
+
+
+def overlapping(capsule: bytes, rest: bytes) -> int:
+    """Return where in a capsule another one begins that extends into the bytes after it; 0 if none does.
+
+    Noise that ends in the head of a capsule passes the eight-bit checksum together with the first bytes of the true one
+    once in 256 times; then the true one begins within it, and what follows is none.
+    """
+    data = capsule + rest[: CAPSULE_BYTES - 1]
+    begins = (begin for begin in range(1, len(capsule)) if is_capsule(data[begin : begin + CAPSULE_BYTES]))
+    return next(begins, 0)
 
 
 def is_near(span_rad: float, usual_rad: float) -> bool:

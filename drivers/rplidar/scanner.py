@@ -168,7 +168,7 @@ class Rplidar(LineScanner):
             new = Measurements(head_rad=head_rad, angle_rad=angle_rad, distance_m=distance_m, arrived_s=arrivals_s)
             turns += list(self._turns.add(new))
         for turn, ended in turns:
-            self._finish(turn, arrived_s, self._turns.count - ended + parser.pending)
+            self._finish(turn, arrived_s, self._turns.count - ended + self._turns.pending + parser.pending)
 
     def _finish(self, turn: Measurements, arrived_s: float, behind: int) -> None:
         """Publish a complete turn, without the measurements that a long gap left behind.

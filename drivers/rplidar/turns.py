@@ -14,6 +14,7 @@ from hal.arrays import Array
 
 JITTER_RAD = math.radians(2.0)  # of the motor
 UNCERTAIN_RAD = math.radians(5.0)  # the motor's speed varies by about 1 percent, so less cannot be told from nothing
+STRAYS, STRAY_RAD = 3, math.radians(20.0)  # beside a damaged measurement some good ones are lost, too
 MOST_MISSING_RAD = math.pi  # with less of a turn, a fall of the angle does not show where the turn ended
 LARGEST_AGE = 1.5  # turns; a gap of more than a turn leaves older measurements behind
 REGULAR = (0.5, 1.5)  # times the median step
@@ -75,21 +76,45 @@ def steps(angle_rad: Array) -> Array:
     return (np.diff(angle_rad) + np.pi) % math.tau - np.pi
 
 
+def strays_beside(head_rad: Array, place: int) -> slice:
+    """Return the fewest measurements before or from `place` on without which the head goes forward; none if too many."""
+    for count in range(1, STRAYS + 1):
+        for begin in (place, place - count):
+            if begin > 0 and begin + count < len(head_rad):
+                over_rad = float(steps(head_rad[[begin - 1, begin + count]])[0])
+                if 0.0 < over_rad < STRAY_RAD:
+                    return slice(begin, begin + count)
+    return slice(0, 0)
+
+
 class TurnCollector:
     """Splits measurements into turns where the angle of the head falls through zero, so a lost start flag does no harm.
 
-    A piece that came twice is taken once. A turn in which the head goes back contains noise and is discarded.
+    A piece that came twice is taken once. Up to three measurements from which or to which the head would go back are left
+    out if their neighbours fit each other; with more of them the turn is discarded. The last three are held back until the
+    next ones show whether they fit.
     """
 
     def __init__(self) -> None:
         self._parts: list[Measurements] = []
         self._last_rad: float | None = None
         self._is_begun = False
+        self._held: Measurements | None = None
         self.count = 0  # measurements taken in so far
         self.discarded = 0
 
+    @property
+    def pending(self) -> int:
+        """Return the number of measurements that are held back."""
+        return 0 if self._held is None else len(self._held)
+
     def add(self, new: Measurements) -> Iterator[tuple[Measurements, int]]:
         """Yield each turn that is now complete, and `count` at its end."""
+        new = self._without_strays(new if self._held is None else joined([self._held, new]))
+        kept = max(0, len(new) - STRAYS)
+        self._held, new = new.at(slice(kept, None)), new.at(slice(0, kept))
+        if len(new) and self._last_rad is not None and steps(np.array([self._last_rad, new.head_rad[0]]))[0] <= 0.0:
+            new = new.at(slice(self._repeated(new), None))
         while len(new):
             last_rad = new.head_rad[0] if self._last_rad is None else self._last_rad
             back = np.flatnonzero(steps(np.concatenate(([last_rad], new.head_rad))) < -JITTER_RAD)
@@ -101,6 +126,15 @@ class TurnCollector:
             elif len(new):
                 self.discarded += self._is_begun
                 self._parts, self._is_begun, self._last_rad = [], False, None
+
+    def _without_strays(self, new: Measurements) -> Measurements:
+        """Return the measurements without the few that do not fit between their neighbours, which fit each other."""
+        known = 0 if self._last_rad is None else 1
+        head_rad = np.concatenate(([self._last_rad] if known else [], new.head_rad))
+        is_good = np.ones(len(head_rad), np.bool_)
+        for place in np.flatnonzero(steps(head_rad) < -JITTER_RAD) + 1:  # the head goes back to this one
+            is_good[strays_beside(head_rad, int(place))] = False
+        return new.at(is_good[known:])
 
     def _split(self, new: Measurements, last_rad: float) -> Iterator[tuple[Measurements, int]]:
         fall_rad = -np.diff(new.head_rad, prepend=last_rad)

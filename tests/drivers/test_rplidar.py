@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.drivers.damaged import burst_damages, turns_given
 from drivers.emulators import rplidar as emulator
 from drivers.emulators.beams import line_m
 from drivers.emulators.faults import FaultOptions, FaultPlan
@@ -351,3 +352,33 @@ def _is_within(seen_m: Any, line: Any) -> bool:
     seen = np.isfinite(seen_m)
     low, high = np.nanmin(near, axis=0), np.nanmax(near, axis=0)
     return bool(np.all((seen_m[seen] >= low[seen] - 0.01) & (seen_m[seen] <= high[seen] + 0.01)))
+
+
+def test_a_head_before_a_capsule_that_passes_its_checksum_with_it_by_chance_gives_no_measurement() -> None:
+    """The checksum has eight bits, so this happens once in 256 times."""
+    at = 5 * CAPSULE_BYTES
+    turns = (emulator.encode_capsules(np.linspace(1.0, 2.0 + 0.01 * k, 384), is_first=False) for k in range(100))
+    lengths = ((turn, n) for turn in turns for n in range(4, 80))
+    chance = ((t, n) for t, n in lengths if is_capsule(t[at : at + n] + t[at : at + CAPSULE_BYTES - n]))
+    turn, length = next(chance)
+    true = turn[at:]
+    given = [points for points in CapsuleParser().feed(turn[:at] + true[:length] + true) if points is not None]
+    exact = {points[2].tobytes() for points in CapsuleParser().feed(turn) if points is not None}
+    assert len(given) >= len(exact) - 1 and all(points[2].tobytes() in exact for points in given)
+
+
+def test_one_measurement_that_does_not_fit_is_left_out_and_its_turn_is_given() -> None:
+    whole = measured(TURN_RAD, np.linspace(1.0, 2.0, 360))
+    for at, stray_rad in ((100, 0.1), (100, 6.0), (359, 3.0), (1, 3.0)):
+        head_rad = TURN_RAD.copy()
+        head_rad[at] = stray_rad
+        [turn, *_] = turns_of(whole, measured(head_rad, whole.distance_m), whole, whole)[1:]
+        np.testing.assert_array_equal(turn.distance_m, np.delete(whole.distance_m, at))
+
+
+@pytest.mark.parametrize("name", burst_damages(1))
+@pytest.mark.parametrize("mode", ["standard", "express"])
+def test_of_a_stream_with_a_damaged_burst_in_twenty_nearly_all_turns_are_given(mode: str, name: str) -> None:
+    found = turns_given(mode, burst_damages(3)[name], 8.0, seed=3)
+    assert found.given >= 0.9 * found.turns
+    assert found.wrong <= (0.005 if mode == "standard" else 0.0) * found.beams, "standard scans have no checksum"

@@ -9,6 +9,7 @@ from typing import Any
 from benchmarks.drivers.bench import WITHOUT_CRC, Bench
 from benchmarks.drivers.camera_benches import CAMERA_BENCHES
 from benchmarks.drivers.gige_bench import GIGE_BENCHES
+from benchmarks.drivers.local_cameras import LOCAL_BENCHES
 from benchmarks.drivers.ros2_benches import ROS2_BENCHES
 from benchmarks.drivers.truths import (
     MovingArm,
@@ -175,7 +176,6 @@ BENCHES = (
         options={"scan_rate_hz": 20.0},
         far_options={"scan_rate_hz": 40.0},
         faults=WITHOUT_CRC,
-        stamps=None,
     ),
     Bench(
         name="rplidar express",
@@ -185,7 +185,6 @@ BENCHES = (
         is_true=true_express,
         options={"scan_rate_hz": 20.0, "mode": "express"},
         far_options={"scan_rate_hz": 40.0, "nodes": 384},
-        stamps=None,
     ),
     Bench(
         name="ur",
@@ -200,6 +199,7 @@ BENCHES = (
     *ROS2_BENCHES,
     *CAMERA_BENCHES,
     *GIGE_BENCHES,
+    *LOCAL_BENCHES,
     Bench(
         name="cia402",
         start=cia402.start,
@@ -274,7 +274,11 @@ def running(bench: Bench, far_options: dict[str, Any]) -> Iterator[tuple[Any, An
     far_side = bench.start(backing, {**bench.far_options, **far_options})
     device = None
     try:
-        device = connect(Context(name="dut"), bench.driver, {**far_side.address, **bench.options})
+        context = Context(name="dut")
+        if bench.make is not None:
+            device = bench.make(context, far_side)
+        else:
+            device = connect(context, bench.driver, {**far_side.address, **bench.options})
         yield device, far_side, backing
     finally:
         if device is not None:

@@ -92,7 +92,7 @@ GIGE_BENCHES = (
         is_true=_is_ramp,
         options={"rate_hz": RATE_HZ, "width_px": WIDTH_PX, "height_px": HEIGHT_PX, "packet_bytes": PACKET_BYTES},
         faults=FAULTS,
-        stamps=None,
+        stamps="device",
         is_alone=True,
     ),
 )

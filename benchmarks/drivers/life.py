@@ -80,7 +80,10 @@ def part_isolation(seconds: float) -> None:
     names = tuple(
         item.name
         for item in BENCHES
-        if item.far_options.get("transport") != "virtual" and item.is_plugged and not item.is_alone
+        if item.far_options.get("transport") != "virtual"
+        and item.is_plugged
+        and not item.is_alone
+        and item.make is None
     )  # a virtual bus is in one process only; a file and a lone program take no orders
     for priority, word in PRIORITIES:
         with far_process(*names) as far, realtime(priority, far.pid) as is_given, ExitStack() as stack:

@@ -31,6 +31,8 @@ def stamp_errors_s(item: Bench, seconds: float) -> Array:
     """Return how wrong each time stamp was, in seconds, by the log of sent frames or by when the value was taken."""
     if item.stamps == "taken" and item.taken_s is not None:
         return _errors_by_value(item, item.taken_s, seconds)
+    if item.stamps == "device":
+        return _errors_by_device(item, seconds)
     stamps_s, log_s = (_record_here if item.stamps == "own log" else _record)(item, seconds)
     within = stamps_s[(stamps_s > log_s[0]) & (stamps_s < log_s[-1])]
     errors_s: Array = np.min(np.abs(log_s[np.newaxis, :] - within[:, np.newaxis]), axis=1)
@@ -47,6 +49,20 @@ def _errors_by_value(item: Bench, taken_s: Callable[[Any, Any], float], seconds:
             for sample in device.mailbox.since(seen)[0]:
                 seen = sample.sequence
                 errors_s.append(abs(sample.host_time_s - taken_s(sample.value, backing)))
+    return np.array(errors_s)
+
+
+def _errors_by_device(item: Bench, seconds: float) -> Array:
+    """Compare stamps, which date the beginning of an exposure, with those of a camera that has this machine's clock."""
+    errors_s, seen = list[float](), 0
+    with running(item, {}) as (device, _, _):
+        rest, end_s = threading.Event(), time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            rest.wait(0.02)
+            for sample in device.mailbox.since(seen)[0]:
+                seen = sample.sequence
+                exposed_s = sample.device_time_s - (time.time() - time.monotonic())
+                errors_s.append(abs(sample.host_time_s + sample.value.exposure_s - exposed_s))
     return np.array(errors_s)
 
 

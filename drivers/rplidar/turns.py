@@ -129,12 +129,12 @@ class TurnCollector:
 
     def _without_strays(self, new: Measurements) -> Measurements:
         """Return the measurements without the few that do not fit between their neighbours, which fit each other."""
-        known = 0 if self._last_rad is None else 1
-        head_rad = np.concatenate(([self._last_rad] if known else [], new.head_rad))
+        last_rad = np.array([] if self._last_rad is None else [self._last_rad], np.float64)
+        head_rad = np.concatenate((last_rad, new.head_rad))
         is_good = np.ones(len(head_rad), np.bool_)
         for place in np.flatnonzero(steps(head_rad) < -JITTER_RAD) + 1:  # the head goes back to this one
             is_good[strays_beside(head_rad, int(place))] = False
-        return new.at(is_good[known:])
+        return new.at(is_good[len(last_rad) :])
 
     def _split(self, new: Measurements, last_rad: float) -> Iterator[tuple[Measurements, int]]:
         fall_rad = -np.diff(new.head_rad, prepend=last_rad)

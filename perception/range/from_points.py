@@ -11,8 +11,9 @@ from hal.errors import NotFound
 from perception.range.sensor import RangeSensorModel
 
 SAME_SURFACE_M = 0.004  # points so near the nearest one in a pixel are averaged, because the nearest alone is biased
-FILL_NEIGHBOURS = 3  # an empty pixel with so many measured neighbours on one surface gets their mean
+FILL_NEIGHBOURS = 3  # an empty pixel with so many measured neighbours on one surface is filled
 FILL_PASSES = 2
+NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (1, 1), (1, 0), (1, -1), (0, 1))  # the last four opposite the first
 
 
 def image_from_points(points_base_m: Array, base_from_view: RigidTransform, sensor: RangeSensorModel) -> Array:
@@ -77,15 +78,18 @@ def _at_centres(means: Array) -> Array:
 def _filled_once(depth: Array, tolerance_m: float) -> Array:
     """Return the image with those empty pixels filled whose known neighbours are enough and lie on one surface.
 
+    A pixel gets the mean of the neighbours that are opposite each other, which is right on an inclined surface, too. Beyond
+    the edge of a surface nothing is filled in: there the mean of all neighbours would be off by the slope of the surface.
+
     `tolerance_m`: largest difference in depth between neighbours on one surface.
     """
     padded = np.pad(depth, 1, constant_values=np.nan)
     h, w = depth.shape
-    around = np.stack(
-        [padded[1 + i : 1 + i + h, 1 + j : 1 + j + w] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    )
+    around = np.stack([padded[1 + i : 1 + i + h, 1 + j : 1 + j + w] for i, j in NEIGHBOURS])
     known = np.isfinite(around).sum(axis=0)
     spread = np.nan_to_num(around, nan=-np.inf).max(axis=0) - np.nan_to_num(around, nan=np.inf).min(axis=0)
-    fill = np.isnan(depth) & (known >= FILL_NEIGHBOURS) & (spread < tolerance_m)
-    total = np.nan_to_num(around).sum(axis=0)
-    return np.where(fill, total / np.maximum(known, 1), depth)
+    opposite = 0.5 * (around[: len(NEIGHBOURS) // 2] + around[len(NEIGHBOURS) // 2 :])
+    pairs = np.isfinite(opposite).sum(axis=0)
+    fill = np.isnan(depth) & (known >= FILL_NEIGHBOURS) & (pairs > 0) & (spread < tolerance_m)
+    total = np.nan_to_num(opposite).sum(axis=0)
+    return np.where(fill, total / np.maximum(pairs, 1), depth)

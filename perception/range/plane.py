@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest, NotFound
-from hal.geometry import UncertainPose
 from perception.range.analysis import checked_depth
 from perception.range.features import RangeFeature, plane_feature
 from perception.range.fitting.surfaces import PLANE, SIZE
@@ -20,7 +19,7 @@ from perception.range.segmentation.finish import refine_surface
 from perception.range.segmentation.grid import Grid, block_size, build_grid
 from perception.range.segmentation.regions import regions_of
 from perception.range.sensor import RangeSensorModel
-from perception.range.sweep import SweptMount
+from perception.range.sweep import SweptErrors
 
 HYPOTHESES = 24  # seeds whose planes are tried, per direction of the normal
 INLIER_SIGMAS = 3.0
@@ -56,7 +55,7 @@ def fit_plane_near(
     sigma_offset_m: float = 0.02,
     sigma_angle_rad: float = 0.1,
     noise: NoiseModel | None = None,
-    swept: UncertainPose | None = None,
+    swept: SweptErrors | None = None,
 ) -> PlaneFit:
     """Fit the largest plane that agrees with an expected one within three standard deviations.
 
@@ -67,7 +66,7 @@ def fit_plane_near(
         point_m, normal: (3,) expected plane in the sensor frame; the normal may point either way.
         sigma_offset_m, sigma_angle_rad: standard deviations of the expectation.
         noise: noise model to use instead of an estimate from the image.
-        swept: mount on the flange of the line scanner from whose sweep the image was put together.
+        swept: errors of the sweep from which the image was put together.
 
     Raises:
         InvalidRequest: the image, sensor or expectation is not usable.
@@ -94,7 +93,7 @@ def fit_plane_near(
     )
     if plane is None:
         raise _nothing_near(sigma_offset_m, sigma_angle_rad)
-    return _fitted(depth, sensor, law, plane, None if swept is None else SweptMount.of(swept))
+    return _fitted(depth, sensor, law, plane, swept)
 
 
 def _checked_expectation(
@@ -186,7 +185,7 @@ def _refitted(points: Array, sigma: Array, plane: Array, sigma_angle_rad: float)
 
 
 def _fitted(
-    depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Array, swept: SweptMount | None
+    depth: Array, sensor: RangeSensorModel, noise: NoiseModel, plane: Array, swept: SweptErrors | None
 ) -> PlaneFit:
     """Fit a plane (4,) to all pixels near it, and collect the result.
 

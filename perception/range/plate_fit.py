@@ -8,7 +8,8 @@ V = A^-1 (sum_c s_c s_c^T) A^-1 + J M J^T,   A = sum_i w_i g_i g_i^T,   s_c = su
 
 e is the distance of a pixel's point from the plane, g its derivative and w the inverse variance (Liang and Zeger,
 Biometrika 73, 1986); with tiles and lines at once: V_tiles + V_lines - V_(lines in tiles) (Cameron, Gelbach and Miller,
-J. Bus. Econ. Stat. 29, 2011). M is the covariance of a swept scanner's mount, and J what it does to the plane.
+J. Bus. Econ. Stat. 29, 2011). M is the covariance of a swept scanner's mount, and J what it does to the plane. If the planes
+of the two passes of a sweep differ by q, the mean of them has the variance q q^T / 4 by errors that one pass has alone.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from hal.arrays import Array
-from perception.range.sweep import SweptMount
+from perception.range.sweep import SweptErrors
 
 TILES_ACROSS, LEAST_TILE_PX = 21, 6  # 3 cm of a panel in an overview
 CLUSTER_TILES = 2
@@ -28,6 +29,7 @@ ROUNDS = 6
 STANDS_OUT, BESIDE = 3.0, 1.0  # sigmas of a tile's mean; beside such a tile, which may show the edge of the same thing
 LEAST_KEPT_SHARE = 0.5  # of a tile's measured pixels; with fewer on the plane it shows the edge of something
 LEAST_TILES = 12
+OUTLIER_PASSES, LEAST_COMMON = 5.0, 200  # sigmas of a pixel; pixels
 MEDIAN_TO_SIGMA = 1.4826
 
 Mask = NDArray[np.bool_]
@@ -51,9 +53,13 @@ class PlateFit:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Pixels:
-    """The measured pixels: points (N, 3), standard deviations of their depths (N,), and what each belongs to (N,)."""
+    """The measured pixels: points (N, 3), standard deviations of their depths (N,), and what each belongs to (N,).
+
+    `apart_m` (N,) is the difference of the depths by two passes, NaN where there is none.
+    """
 
     points_m: Array
+    apart_m: Array
     sigma_m: Array
     tile: Labels
     row: Labels
@@ -75,7 +81,7 @@ def fit_plate(
     offset_m: float,
     frame: Array,
     gate: float,
-    swept: SweptMount | None = None,
+    swept: SweptErrors | None = None,
 ) -> PlateFit | None:
     """Refine a plane; None if too few tiles lie on it.
 
@@ -84,9 +90,9 @@ def fit_plate(
         sigma_m: (H, W) standard deviation of depth.
         normal, offset_m, frame: initial plane, and two unit vectors (2, 3) in it.
         gate: pixels further away, in sigmas, are of something else.
-        swept: the image was put together from a sweep, so each row may have an error of its own.
+        swept: errors of the sweep from which the image was put together; then each row may have an error of its own.
     """
-    pixels = _pixels(points_m, sigma_m)
+    pixels = _pixels(points_m, sigma_m, None if swept is None else swept.apart_m)
     n, d, f = np.asarray(normal, float), float(offset_m), np.asarray(frame, float)
     kept = np.zeros(len(pixels.points_m), bool)
     for _ in range(ROUNDS):
@@ -106,13 +112,14 @@ def fit_plate(
     return PlateFit(normal=n, offset_m=d, frame=f, covariance=_covariance(pixels, kept, n, d, f, swept))
 
 
-def _pixels(points_m: Array, sigma_m: Array) -> _Pixels:
+def _pixels(points_m: Array, sigma_m: Array, apart_m: Array | None) -> _Pixels:
     seen = np.isfinite(points_m[..., 2])
     row, column = np.nonzero(seen)
     tile_px = max(LEAST_TILE_PX, round(seen.shape[1] / TILES_ACROSS))
     cluster_px, across = tile_px * CLUSTER_TILES, seen.shape[1] // tile_px + 1
     return _Pixels(
         points_m=points_m[seen],
+        apart_m=(np.full(seen.shape, np.nan) if apart_m is None else apart_m)[seen],
         sigma_m=sigma_m[seen],
         tile=row // tile_px * across + column // tile_px,
         row=row,
@@ -144,7 +151,7 @@ def _derivatives(points_m: Array, frame: Array) -> Array:
     return np.column_stack([points_m @ frame.T, -np.ones(len(points_m))])
 
 
-def _covariance(pixels: _Pixels, kept: Mask, n: Array, d: float, frame: Array, swept: SweptMount | None) -> Array:
+def _covariance(pixels: _Pixels, kept: Mask, n: Array, d: float, frame: Array, swept: SweptErrors | None) -> Array:
     points_m = pixels.points_m[kept]
     g, w, e = _derivatives(points_m, frame), pixels.weights(n)[kept], points_m @ n - d
     inverse = np.linalg.inv((g * w[:, None]).T @ g)
@@ -156,8 +163,21 @@ def _covariance(pixels: _Pixels, kept: Mask, n: Array, d: float, frame: Array, s
     found = _at_least(np.asarray(inverse @ meat @ inverse), independent)
     if swept is not None:
         J = inverse @ (g * w[:, None]).T @ swept.distances(points_m, n)
-        found = found + J @ swept.covariance @ J.T
+        late = swept.sigma_turn_rad * (inverse @ (g * w[:, None]).T @ swept.turned(points_m, n))
+        apart = _between_passes(points_m, pixels.apart_m[kept], g, w, n)
+        found = found + J @ swept.covariance @ J.T + np.outer(late, late) + np.outer(apart, apart) / 4.0
     return found
+
+
+def _between_passes(points_m: Array, apart_m: Array, g: Array, w: Array, n: Array) -> Array:
+    """Return the difference (3,) between the planes of the two passes of a sweep; zero if there is too little of both."""
+    along_m = apart_m * (points_m @ n) / points_m[:, 2]
+    known = np.isfinite(along_m)
+    known[known] &= np.abs(along_m[known]) * np.sqrt(w[known]) < OUTLIER_PASSES
+    if known.sum() < LEAST_COMMON:
+        return np.zeros(3)
+    gk, wk = g[known], w[known]
+    return np.asarray(np.linalg.solve((gk * wk[:, None]).T @ gk, gk.T @ (wk * along_m[known])))
 
 
 def _summed(scores: Array, cluster: Labels) -> Array:

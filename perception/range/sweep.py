@@ -25,6 +25,7 @@ from perception.range.sensor import PinholeSensor
 
 LONGEST_GAP_S = 0.1  # between two poses; at 1 m/s^2 the path deviates at most 1.3 mm from a straight line in this time
 DELAY_STEP_S, DELAY_ROUNDS = 0.02, 3  # over a shorter step the noise of the depths would count
+STAMP_SIGMA_S = 5e-4  # of the mean stamp of one pass; single stamps of the drivers are 0.1 to 1.3 ms wrong at p99
 MOST_DELAY_S = 0.1  # older data are left out by the drivers
 OUTLIER = 5.0  # median deviations
 
@@ -88,25 +89,37 @@ class SweepPass:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SweptMount:
-    """What an error of the scanner's mount does to the image of a sweep beyond what it does to a range camera's image.
+class SweptErrors:
+    """Errors of the image of a sweep that a range camera's image does not have.
 
     With the error (d, r) of the mount a range camera sees each point X shifted by d + r x X. In a sweep the error turns
     with the scanner, by the angle a about its x axis at which X was seen, so there is, to first order, in addition
 
     (R(a) - 1) d + ((R(a) - 1) r) x X,   a = atan2(-y, z)
 
+    Two passes the same way round share neither the errors of the arm's path nor those of the time stamps, and their
+    difference shows how large those are. The delay that both have in common is taken out, but not the difference of the
+    two delays, which turns the image about the x axis.
+
     Attributes:
         covariance: (6, 6) of (d, r), m and rad, in the axes of the scanner as it stood before the sweep.
+        apart_m: (H, W) difference of the depths by the two passes, NaN where not both measured; None with one pass.
+        sigma_turn_rad: of the angle about the x axis by which the time stamps turn the image.
     """
 
     covariance: Array
+    apart_m: Array | None = None
+    sigma_turn_rad: float = 0.0
 
     @classmethod
-    def of(cls, mount: UncertainPose) -> SweptMount:
-        """Return it for a mount, whose covariance is in the axes of the flange."""
+    def of(cls, mount: UncertainPose, *, apart_m: Array | None = None, rate_rad_per_s: float = 0.0) -> SweptErrors:
+        """Return it for a mount, whose covariance is in the axes of the flange, and the speed of the sweep."""
         turn = np.kron(np.eye(2), matrix_of(mount.parent_from_child).T)
-        return cls(covariance=turn @ mount.covariance @ turn.T)
+        return cls(
+            covariance=turn @ mount.covariance @ turn.T,
+            apart_m=apart_m,
+            sigma_turn_rad=rate_rad_per_s * STAMP_SIGMA_S / math.sqrt(2.0),
+        )
 
     def distances(self, points_m: Array, normal: Array) -> Array:
         """Return by how much points (N, 3) move along `normal` (3,), per unit of the error (N, 6)."""
@@ -114,6 +127,19 @@ class SweptMount:
         back = turned.inv()
         across = np.cross(points_m, normal)
         return np.hstack([back.apply(normal) - normal, back.apply(across) - across])
+
+    def turned(self, points_m: Array, normal: Array) -> Array:
+        """Return by how much points (N, 3) move along `normal` (3,), per radian about the x axis."""
+        return np.asarray(np.cross([1.0, 0.0, 0.0], points_m) @ normal)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImageOfSweep:
+    """Depth (H, W) in metres, NaN where nothing was measured; its geometry; `apart_m` as in `SweptErrors`."""
+
+    depth_m: Array
+    view: PinholeSensor
+    apart_m: Array | None
 
 
 def image_from_sweep(
@@ -123,8 +149,8 @@ def image_from_sweep(
     base_from_view: RigidTransform,
     half_height_rad: float,
     swept_rad: float,
-) -> tuple[Array, PinholeSensor]:
-    """Return depth (H, W) in metres and geometry of the image that a range camera at `base_from_view` would have taken.
+) -> ImageOfSweep:
+    """Return the image that a range camera at `base_from_view` would have taken.
 
     A pixel is as wide as the step between two beams in the middle of the image, and as high as the rotation between two
     scans of one pass. With two passes the delay of the time stamps is estimated and taken out.
@@ -155,8 +181,13 @@ def image_from_sweep(
         cy_px=(height - 1) / 2.0,
     )
     delay_s = delay_between(passes[0], passes[1], c, base_from_view, view) if len(passes) == 2 else 0.0
-    points = np.concatenate([one.points(c, delay_s) for one in passes])
-    return image_from_points(points, base_from_view, view), view
+    points = [one.points(c, delay_s) for one in passes]
+    images = [image_from_points(some, base_from_view, view) for some in points] if len(passes) == 2 else []
+    return ImageOfSweep(
+        depth_m=image_from_points(np.concatenate(points), base_from_view, view),
+        view=view,
+        apart_m=np.subtract(*images) if images else None,
+    )
 
 
 def delay_between(

@@ -23,7 +23,7 @@ from hal.geometry import UncertainPose
 from hal.motion import CartesianPath, Hold, MotionOutcome
 from hal.readings import Cause, Quality, Stamped
 from manipulation import plan_sweep, plausibility
-from perception.range import PinholeSensor, ScannerTrack, SweepPass, image_from_sweep
+from perception.range import PinholeSensor, ScannerTrack, SweepPass, SweptErrors, image_from_sweep
 from service.operations.session import Session
 from service.operations.travel import kinematics, skill_context
 
@@ -64,7 +64,13 @@ class Scan:
     scanner: str
     capabilities: RangeScannerCapabilities
     base_from_scanner: UncertainPose
-    is_swept: bool = False
+    swept: SweptImage | None = None
+
+    def swept_errors(self, mount: UncertainPose) -> SweptErrors | None:
+        """Return the errors of the sweep with a scanner on this mount; None if nothing was swept."""
+        if self.swept is None:
+            return None
+        return SweptErrors.of(mount, apart_m=self.swept.apart_m, rate_rad_per_s=self.swept.rate_rad_per_s)
 
     def pinhole(self) -> PinholeSensor:
         """Return the scanner's model.
@@ -86,11 +92,15 @@ class SweptImage:
         depth_m: (H, W) as from a range camera in the pose before the sweep; NaN where nothing was measured.
         capabilities: of that camera.
         newest: the last scan.
+        apart_m: (H, W) difference of the depths by the two passes.
+        rate_rad_per_s: speed of the sweep.
     """
 
     depth_m: NDArray[np.float32]
     capabilities: RangeScannerCapabilities
     newest: Stamped[RangeImage]
+    apart_m: NDArray[np.float64] | None
+    rate_rad_per_s: float
 
 
 def device_of_kind(session: Session, kind: DeviceKind, name: str | None = None) -> tuple[str, Any]:
@@ -167,7 +177,7 @@ def scan(session: Session) -> Scan:
             scanner=name,
             capabilities=swept.capabilities,
             base_from_scanner=base_from(session, name),
-            is_swept=True,
+            swept=swept,
         )
     asked_s = session.connection.clock.now_s()
     sample = device.read_range(deadline=deadline())
@@ -224,23 +234,25 @@ def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
         )
     c: RangeScannerCapabilities = device.capabilities()
     state, mount = session.mover.state(), session.mount(name).parent_from_child
+    rate_rad_per_s = sweep_rate_rad_per_s(c)
     sweep = plan_sweep(
         skill_context(session),
         mount,
-        rate_rad_per_s=sweep_rate_rad_per_s(c),
+        rate_rad_per_s=rate_rad_per_s,
         start_rad=state.position_rad,
         width_m=state.gripper_width_m,
     )
     session.run(sweep.out)
     passes = [_record(session, name, device, motion) for motion in (sweep.across, sweep.again)]
     session.run(sweep.back)
-    depth_m, view = image_from_sweep(
+    image = image_from_sweep(
         passes,
         c,
         base_from_view=kinematics(session).tool(state.position_rad, mount),
         half_height_rad=max(sweep.up_rad, sweep.down_rad),
         swept_rad=sweep.up_rad + sweep.down_rad,
     )
+    view = image.view
     as_camera = replace(
         c,
         projection="pinhole",
@@ -251,7 +263,13 @@ def sweep_scanner(session: Session, name: str, device: Any) -> SweptImage:
         cx=view.cx_px,
         cy=view.cy_px,
     )
-    return SweptImage(depth_m=depth_m.astype(np.float32), capabilities=as_camera, newest=passes[-1].scans[-1])
+    return SweptImage(
+        depth_m=image.depth_m.astype(np.float32),
+        capabilities=as_camera,
+        newest=passes[-1].scans[-1],
+        apart_m=image.apart_m,
+        rate_rad_per_s=rate_rad_per_s,
+    )
 
 
 def _record(session: Session, name: str, device: Any, motion: CartesianPath) -> SweepPass:

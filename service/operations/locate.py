@@ -103,7 +103,7 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
         normal=pose.rotation.apply([0.0, 0.0, 1.0]),
         sigma_offset_m=float(max(sigma[:3].max(), 0.005)),
         sigma_angle_rad=float(max(sigma[3:].max(), 0.01)),
-        swept=session.mount(image.scanner) if image.is_swept else None,
+        swept=image.swept_errors(session.mount(image.scanner)),
     )
     flange = session.mover.state().base_from_flange
     observation = PlaneObservation(

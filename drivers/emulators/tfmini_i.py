@@ -49,7 +49,12 @@ class Measurement:
         self._clock_start_ms = options.clock_start_ms
         self._start_s = time.monotonic()
         self._clock = WallClock()
-        self.newest = (0, WEAK, options.clock_start_ms)
+        self._newest: tuple[int, int, int] | None = None
+
+    @property
+    def newest(self) -> tuple[int, int, int]:
+        """Return the last measurement; the first one is made when it is asked for."""
+        return self._newest or self.renew()
 
     def renew(self) -> tuple[int, int, int]:
         """Measure, and return distance (cm), strength and clock (ms)."""
@@ -57,8 +62,8 @@ class Measurement:
         sample = self._backing.read_distance_m(deadline=Deadline.after(self._clock, BACKING_S))
         is_seen = sample.quality is not Quality.INVALID
         stamp_ms = (self._clock_start_ms + passed_ms) & 0xFFFFFFFF
-        self.newest = (round(sample.value * 100.0) if is_seen else 0, STRONG if is_seen else WEAK, stamp_ms)
-        return self.newest
+        self._newest = (round(sample.value * 100.0) if is_seen else 0, STRONG if is_seen else WEAK, stamp_ms)
+        return self._newest
 
 
 class TfminiITable(RegistersOnly):

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.emulators import dynamixel, ft300, netft, robotiq_2f
+from drivers.emulators import dynamixel, dynamixel_gripper, ft300, netft, robotiq_2f
 from drivers.emulators.scripted import ScriptedArm, ScriptedForceTorque, ScriptedGripper, scripted_wrench
 from drivers.transport.checks import crc_dynamixel, crc_modbus, crc_x25
 from tests.drivers.rigs import until
@@ -56,6 +56,27 @@ def test_dynamixel_sdk_reads_writes_and_sync_reads() -> None:
             write.addParam(id_, list((2048 + 10 * id_).to_bytes(4, "little")))
         assert write.txPacket() == sdk.COMM_SUCCESS
         until(lambda: bool(np.allclose(arm.position_rad, np.arange(1, 7) * 10 * 2 * np.pi / 4096)))
+    finally:
+        port.closePort()
+        far_side.close()
+
+
+@pytest.mark.third_party("dynamixel-sdk", "serial:dynamixel_gripper")
+def test_dynamixel_sdk_closes_the_gripper_and_reads_where_it_stopped() -> None:
+    sdk: Any = pytest.importorskip("dynamixel_sdk")
+    sdk.port_handler.LATENCY_TIMER = 500  # ms
+    gripper = ScriptedGripper(object_m=0.04)
+    far_side = dynamixel_gripper.start(gripper, {})
+    port, packet = sdk.PortHandler(far_side.address["port"]), sdk.PacketHandler(2.0)
+    try:
+        assert port.openPort() and port.setBaudRate(1_000_000)
+        assert packet.ping(port, dynamixel_gripper.ID) == (1020, sdk.COMM_SUCCESS, 0)
+        assert packet.write1ByteTxRx(port, dynamixel_gripper.ID, 64, 1) == (sdk.COMM_SUCCESS, 0)
+        closed = dynamixel_gripper.CLOSED_COUNT
+        assert packet.write4ByteTxRx(port, dynamixel_gripper.ID, 116, closed) == (sdk.COMM_SUCCESS, 0)
+        share = 0.04 / far_side.address["stroke_m"]
+        held = round(closed + share * (dynamixel_gripper.OPEN_COUNT - closed))
+        until(lambda: abs(packet.read4ByteTxRx(port, dynamixel_gripper.ID, 132)[0] - held) <= 2)
     finally:
         port.closePort()
         far_side.close()

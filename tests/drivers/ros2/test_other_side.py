@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.emulators import ros2
-from drivers.emulators.scripted import ScriptedArm, ScriptedGripper
+from drivers.emulators.scripted import ScriptedArm, ScriptedForceTorque, ScriptedGripper, scripted_wrench
 
 CLIENT = """
 import json
@@ -72,6 +72,30 @@ done.wait(20)
 print(json.dumps(results, default=str))
 ros.terminate()
 """
+WRENCH_CLIENT = """
+import json
+import sys
+import threading
+
+import roslibpy
+
+ros = roslibpy.Ros("127.0.0.1", int(sys.argv[1]))
+ros.run(timeout=20)
+seen, is_enough = [], threading.Event()
+
+
+def take(message):
+    seen.append([message["wrench"][part][axis] for part in ("force", "torque") for axis in "xyz"])
+    if len(seen) == 5:
+        is_enough.set()
+
+
+topic = roslibpy.Topic(ros, "/force_torque_sensor_broadcaster/wrench", "geometry_msgs/WrenchStamped")
+topic.subscribe(take)
+is_enough.wait(20)
+print(json.dumps(seen[:5]))
+ros.terminate()
+"""
 
 
 def run_client(program: str, *arguments: str) -> str:
@@ -105,3 +129,16 @@ def test_a_client_of_others_closes_the_emulated_gripper_by_the_action() -> None:
         assert result["values"]["stalled"] is True and result["values"]["reached_goal"] is False
     finally:
         far_side.close()
+
+
+@pytest.mark.third_party("roslibpy", "ros2:force_torque")
+def test_a_client_of_others_hears_the_emulated_wrench() -> None:
+    far_side = ros2.start(ScriptedForceTorque(), {})
+    try:
+        heard = json.loads(run_client(WRENCH_CLIENT, str(far_side.address["port"])))
+    finally:
+        far_side.close()
+    first = round(heard[0][0] / 0.01)  # the force tells which reading it is
+    for index, wrench in enumerate(heard):
+        true = scripted_wrench(first + index)
+        np.testing.assert_allclose(wrench, [*true.force_n, *true.torque_nm], atol=1e-9)

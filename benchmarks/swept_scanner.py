@@ -120,7 +120,6 @@ def seen_from_the_overview(session: Session) -> Seen:
 def measure(name: str, way: str, seed: int) -> Seen:
     """Return what one scanner sees in one world."""
     cell = with_scanner(load_cell(ROOT / f"cells/{name}.toml", seed=seed), way)
-    cell = with_scanner(load_cell(ROOT / f"cells/{name}.toml", seed=seed), way)
     with tempfile.TemporaryDirectory() as folder, session_of(cell, Path(folder)) as session:
         return seen_from_the_overview(session)
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.kinds.line_scanners import Beams, LineScanner
+from drivers.kinds.line_scanners import Beams, Bias, LineScanner
 from drivers.transport.capture import inside
 from drivers.transport.checks import crc_sick
 from drivers.transport.framing import Framer
@@ -53,6 +53,7 @@ class Lms200Options(SerialOptions):
     ] = 100
     max_range_m: Annotated[float, Field(gt=0, le=80, description="a larger distance has no value")] = 8.0
     sigma_m: Annotated[float, Field(gt=0, description="noise of one distance, one sigma")] = 0.015
+    bias_sigma_m: Bias = 0.0
 
 
 def telegram(payload: bytes, *, address: int = 0) -> bytes:
@@ -109,7 +110,7 @@ class Lms200(LineScanner):
         line_s = (2 * beams.count + 10) * 10 / options.baud
         super().__init__(context, open_link=opener, link_name=name, max_age_s=3 * max(beams.scan_s, line_s) + 0.1)
         self.beams, self.line_s = beams, line_s
-        self.sigma_m = options.sigma_m
+        self.sigma_m, self.bias_sigma_m = options.sigma_m, options.bias_sigma_m
         self._options = options
         self._framer = framer(payload_bytes=2 * beams.count + 4)
         self._bad_before = 0

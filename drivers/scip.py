@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.kinds.line_scanners import Beams, LineScanner, within
+from drivers.kinds.line_scanners import Beams, Bias, LineScanner, within
 from drivers.transport.checks import sum_scip
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
 from drivers.transport.options import EitherOptions, PortNumber, SerialPath, either_opener, read_options
@@ -39,6 +39,7 @@ class ScipOptions(EitherOptions):
         int, Field(ge=0, le=9, description="scans that the scanner leaves out after each one it sends")
     ] = 0
     sigma_m: Annotated[float, Field(gt=0, description="noise of one distance, one sigma")] = 0.01
+    bias_sigma_m: Bias = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +137,7 @@ class Scip(LineScanner):
     def __init__(self, context: Context, options: ScipOptions) -> None:
         opener, name = either_opener(options, context.name)
         super().__init__(context, open_link=opener, link_name=name, max_age_s=0.05)
-        self.sigma_m = options.sigma_m
+        self.sigma_m, self.bias_sigma_m = options.sigma_m, options.bias_sigma_m
         self._options = options
         self._parser = ScipParser()
         self._request = ""

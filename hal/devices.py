@@ -221,7 +221,8 @@ class RangeScannerCapabilities:
 
     `pinhole`: point = ((u - cx)/fx z, (v - cy)/fy z, z), z along the view. `orthographic`: fx, fy in pixels per metre,
     point = ((u - cx)/fx, (v - cy)/fy, z). `polar`: one line of `width` beams from `first_angle_rad` in steps of
-    `step_angle_rad` about the sensor's y axis, distances along the beam.
+    `step_angle_rad` about the sensor's y axis, distances along the beam. `sigma_m` is the noise of one distance, and
+    `bias_sigma_m` one sigma of an error that all of them have in common.
     """
 
     projection: Literal["pinhole", "orthographic", "polar"]
@@ -237,6 +238,7 @@ class RangeScannerCapabilities:
     rate_hz: float
     first_angle_rad: float = 0.0
     step_angle_rad: float = 0.0
+    bias_sigma_m: float = 0.0
 
     @property
     def needs_sweep(self) -> bool:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from drivers.transport.stream import StreamDevice
 from hal.arrays import Array
@@ -15,6 +17,12 @@ from hal.devices import DeviceKind, RangeImage, RangeScannerCapabilities
 from hal.errors import DeviceUnavailable
 from hal.readings import Cause, Quality, Stamped
 
+Bias = Annotated[
+    float,
+    Field(
+        ge=0, description="error that all distances have in common, one sigma: the systematic error in the data sheet"
+    ),
+]
 MOST_KEPT = 4000  # scans kept per sweep: 50 s of the fastest scanner
 
 
@@ -36,6 +44,7 @@ class LineScanner(StreamDevice[RangeImage]):
     kind = DeviceKind.RANGE_SCANNER
     beams: Beams | None = None
     sigma_m = 0.01
+    bias_sigma_m = 0.0
     line_s = 0.0  # time that one scan takes on a slow line
     _kept: deque[Stamped[RangeImage]] | None = None
 
@@ -62,6 +71,7 @@ class LineScanner(StreamDevice[RangeImage]):
             rate_hz=1.0 / max(b.scan_s, self.line_s),
             first_angle_rad=b.first_rad,
             step_angle_rad=b.step_rad,
+            bias_sigma_m=self.bias_sigma_m,
         )
 
     def read_range(self, *, deadline: Deadline) -> Stamped[RangeImage]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.kinds.line_scanners import Beams, LineScanner, within
+from drivers.kinds.line_scanners import Beams, Bias, LineScanner, within
 from drivers.rplidar.express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points
 from drivers.rplidar.nodes import NodeParser, decode
 from drivers.rplidar.turns import LARGEST_AGE, MOST_MISSING_RAD, Measurements, TurnCollector, missing_rad
@@ -57,6 +57,7 @@ class RplidarOptions(SerialOptions):
     min_range_m: Annotated[float, Field(ge=0, description="a smaller distance has no value")] = 0.15
     max_range_m: Annotated[float, Field(gt=0, description="a larger distance has no value")] = 12.0
     sigma_m: Annotated[float, Field(gt=0, description="noise of one distance, one sigma")] = 0.01
+    bias_sigma_m: Bias = 0.0
 
 
 def descriptor(length: int, mode: int, kind: int) -> bytes:
@@ -81,7 +82,7 @@ class Rplidar(LineScanner):
             max_range_m=options.max_range_m,
             scan_s=scan_s,
         )
-        self.sigma_m = options.sigma_m
+        self.sigma_m, self.bias_sigma_m = options.sigma_m, options.bias_sigma_m
         self._is_express = options.mode == "express"
         self._nodes, self._capsules, self._turns = NodeParser(), CapsuleParser(), TurnCollector()
         self._pauses = Pauses()

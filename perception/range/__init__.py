@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from perception.range.recordings import Reading, assumptions, load_recording
     from perception.range.render import MARK, picture, scene_json, write_ply, write_png
     from perception.range.sensor import OrthographicSensor, PinholeSensor
-    from perception.range.sweep import ScannerTrack, SweepPass, SweptErrors, image_from_sweep
+    from perception.range.sweep import SweepPass, SweptErrors, image_from_sweep
     from perception.range.warm import warm_up
 
 __all__ = [
@@ -38,7 +38,6 @@ __all__ = [
     "PlaneFit",
     "RangeScene",
     "Reading",
-    "ScannerTrack",
     "Sighting",
     "Sphere",
     "Surface",

@@ -162,10 +162,13 @@ def _covariance(pixels: _Pixels, kept: Mask, n: Array, d: float, frame: Array, s
     independent = np.asarray(inverse * max(float(np.mean(w * e * e)), 1e-12))
     found = _at_least(np.asarray(inverse @ meat @ inverse), independent)
     if swept is not None:
-        J = inverse @ (g * w[:, None]).T @ swept.distances(points_m, n)
-        late = swept.sigma_turn_rad * (inverse @ (g * w[:, None]).T @ swept.turned(points_m, n))
+        plane_of = inverse @ (g * w[:, None]).T  # of distances from the plane
+        J = plane_of @ swept.distances(points_m, n)
+        late = swept.sigma_turn_rad * (plane_of @ swept.turned(points_m, n))
+        far = swept.sigma_range_m * (plane_of @ swept.farther(points_m, n))
         apart = _between_passes(points_m, pixels.apart_m[kept], g, w, n)
-        found = found + J @ swept.covariance @ J.T + np.outer(late, late) + np.outer(apart, apart) / 4.0
+        found = found + J @ swept.covariance @ J.T + np.outer(late, late) + np.outer(far, far)
+        found = found + np.outer(apart, apart) / 4.0
     return found
 
 

@@ -75,6 +75,17 @@ class SweepPass:
     scans: Sequence[Stamped[RangeImage]]
     track: ScannerTrack
 
+    @classmethod
+    def recorded(
+        cls,
+        scans: Sequence[Stamped[RangeImage]],
+        *,
+        times_s: Sequence[float],
+        base_from_scanner: Sequence[RigidTransform],
+    ) -> SweepPass:
+        """Return the pass of these scans and of the scanner's poses at increasing times."""
+        return cls(scans=scans, track=ScannerTrack(times_s=times_s, base_from_scanner=base_from_scanner))
+
     def covered(self, c: RangeScannerCapabilities, delay_s: float = 0.0) -> list[Stamped[RangeImage]]:
         """Return the scans with a known pose for every beam, with stamps that are not late any more."""
         moved = [replace(scan, host_time_s=scan.host_time_s - delay_s) for scan in self.scans]
@@ -105,20 +116,30 @@ class SweptErrors:
         covariance: (6, 6) of (d, r), m and rad, in the axes of the scanner as it stood before the sweep.
         apart_m: (H, W) difference of the depths by the two passes, NaN where not both measured; None with one pass.
         sigma_turn_rad: of the angle about the x axis by which the time stamps turn the image.
+        sigma_range_m: of an error that all distances have in common.
     """
 
     covariance: Array
     apart_m: Array | None = None
     sigma_turn_rad: float = 0.0
+    sigma_range_m: float = 0.0
 
     @classmethod
-    def of(cls, mount: UncertainPose, *, apart_m: Array | None = None, rate_rad_per_s: float = 0.0) -> SweptErrors:
+    def of(
+        cls,
+        mount: UncertainPose,
+        *,
+        apart_m: Array | None = None,
+        rate_rad_per_s: float = 0.0,
+        sigma_range_m: float = 0.0,
+    ) -> SweptErrors:
         """Return it for a mount, whose covariance is in the axes of the flange, and the speed of the sweep."""
         turn = np.kron(np.eye(2), matrix_of(mount.parent_from_child).T)
         return cls(
             covariance=turn @ mount.covariance @ turn.T,
             apart_m=apart_m,
             sigma_turn_rad=rate_rad_per_s * STAMP_SIGMA_S / math.sqrt(2.0),
+            sigma_range_m=sigma_range_m,
         )
 
     def distances(self, points_m: Array, normal: Array) -> Array:
@@ -127,6 +148,10 @@ class SweptErrors:
         back = turned.inv()
         across = np.cross(points_m, normal)
         return np.hstack([back.apply(normal) - normal, back.apply(across) - across])
+
+    def farther(self, points_m: Array, normal: Array) -> Array:
+        """Return by how much points (N, 3) move along `normal` (3,), per unit of an error of all distances."""
+        return np.asarray(points_m @ normal / np.linalg.norm(points_m, axis=1))
 
     def turned(self, points_m: Array, normal: Array) -> Array:
         """Return by how much points (N, 3) move along `normal` (3,), per radian about the x axis."""

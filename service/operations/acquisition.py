@@ -23,7 +23,7 @@ from hal.geometry import UncertainPose
 from hal.motion import CartesianPath, Hold, MotionOutcome
 from hal.readings import Cause, Quality, Stamped
 from manipulation import plan_sweep, plausibility
-from perception.range import PinholeSensor, ScannerTrack, SweepPass, SweptErrors, image_from_sweep
+from perception.range import PinholeSensor, SweepPass, SweptErrors, image_from_sweep
 from service.operations.session import Session
 from service.operations.travel import kinematics, skill_context
 
@@ -70,7 +70,12 @@ class Scan:
         """Return the errors of the sweep with a scanner on this mount; None if nothing was swept."""
         if self.swept is None:
             return None
-        return SweptErrors.of(mount, apart_m=self.swept.apart_m, rate_rad_per_s=self.swept.rate_rad_per_s)
+        return SweptErrors.of(
+            mount,
+            apart_m=self.swept.apart_m,
+            rate_rad_per_s=self.swept.rate_rad_per_s,
+            sigma_range_m=self.capabilities.bias_sigma_m,
+        )
 
     def pinhole(self) -> PinholeSensor:
         """Return the scanner's model.
@@ -287,11 +292,11 @@ def _record(session: Session, name: str, device: Any, motion: CartesianPath) -> 
         what = f"{name} gave no valid line in a sweep of {report.duration_s:.1f} s"
         raise NotFound(what, hint=_rate_hint(device.capabilities()))
     arm, mount = kinematics(session), session.mount(name).parent_from_child
-    track = ScannerTrack(
+    return SweepPass.recorded(
+        good,
         times_s=tuple(report.log.started_s + report.log.times_s),
         base_from_scanner=tuple(arm.tool(q, mount) for q in report.log.positions_rad),
     )
-    return SweepPass(scans=good, track=track)
 
 
 def sweep_rate_rad_per_s(c: RangeScannerCapabilities) -> float:

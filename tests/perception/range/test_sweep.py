@@ -230,6 +230,9 @@ def test_passes_that_lie_apart_make_the_plane_as_uncertain_as_half_of_their_dist
         for errors in (SweptErrors.of(EXACT), SweptErrors.of(EXACT, apart_m=image.apart_m))
     ]
     assert sigmas_m[0] < 5e-5 and sigmas_m[1] == pytest.approx(2e-4, rel=0.2)
+    biased = SweptErrors.of(EXACT, sigma_range_m=3e-3)
+    feature = fit_plane_near(image.depth_m, image.view, point_m=POINT_M, normal=NORMAL, swept=biased).feature
+    assert feature.sigma_point_m == pytest.approx(3e-3, rel=0.1), "an error of all distances is not averaged out"
 
 
 def test_a_mount_that_needs_no_turn_adds_nothing() -> None:

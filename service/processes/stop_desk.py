@@ -85,6 +85,7 @@ class StopDesk:
         self._host = host
         self._records = records
         self._noted = latch.state().count
+        latch.note_recorded(self._noted)  # the stop port waits for records from now on
         self._noted_s = time.monotonic()
         self._noting = threading.Lock()
 

@@ -80,9 +80,8 @@ class ImageStore:
                     )
                 partial = self._folder / f"{image_id}.part"
                 try:
-                    with partial.open("wb") as file:
-                        file.write(data)
-                        file.flush()
+                    partial.write_bytes(data)
+                    with partial.open("rb") as file:
                         os.fsync(file.fileno())
                     partial.rename(self._folder / f"{image_id}{suffix}")
                     flush_folder(self._folder)

@@ -6,6 +6,9 @@ import pytest
 from hypothesis import settings
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, print_blob=True)
+settings.register_profile(
+    "long", deadline=None, print_blob=True
+)  # for the figures; see tests/service/http/test_life_cycle.py
 settings.load_profile("repeatable")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import httpx2
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
@@ -18,10 +18,11 @@ NAMES = st.sampled_from(["alice", "bob"])
 PICK = st.integers(0, 3)
 IS_LONG = settings.get_current_profile_name() == "long"
 LIMITS = settings(
-    max_examples=2000 if IS_LONG else 8,
-    stateful_step_count=50 if IS_LONG else 14,
+    max_examples=2000 if IS_LONG else 25,
+    stateful_step_count=50 if IS_LONG else 30,
     deadline=None,
     suppress_health_check=list(HealthCheck),
+    phases=[Phase.generate, Phase.shrink] if IS_LONG else [Phase.generate],  # shrinking takes minutes
 )
 
 
@@ -70,6 +71,7 @@ class Life(RuleBasedStateMachine):
         if may and not old:
             self.is_latched = False
             self.counts.append(answer.json()["count"])
+            self.lose_all()  # each change of the latch ends what was asked for before, also a reset of a clear one
 
     @rule(name=NAMES)
     def acquire(self, name: str) -> None:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hal.errors import DeviceFault, Stopped
-from hal.motion import Hold, MotionOutcome
+from hal.errors import DeviceFault, MotionRefused, Stopped
+from hal.motion import Guard, Hold, MotionOutcome, Quantity
 from tests.manipulation.control.test_controller import forwards
 from tests.manipulation.rig import HOME, Rig
 
@@ -174,3 +174,18 @@ def test_after_a_stop_the_first_set_point_is_the_measured_position(rig: Rig) -> 
     rig.world.commands.clear()
     rig.controller.execute(Hold(name="still", duration_s=0.02))
     assert np.abs(rig.world.commands[0] - moved).max() < 1e-9
+
+
+def test_no_tare_while_the_stop_is_latched(rig: Rig) -> None:
+    rig.latched[0] = True
+    with pytest.raises(Stopped):
+        rig.controller.tare()
+    assert rig.world.commands == []
+
+
+def test_a_motion_that_ends_by_a_force_does_not_start_where_nothing_measures_it(rig: Rig) -> None:
+    rig.controller._devices = replace(rig.controller._devices, force_torque=None)
+    touch = Guard(name="contact", quantity=Quantity.FORCE, limit=5.0)
+    with pytest.raises(MotionRefused, match="nothing measures the force"):
+        rig.controller.execute(forwards(0.1, guards=(touch,)))
+    assert rig.world.commands == []

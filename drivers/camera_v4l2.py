@@ -17,6 +17,7 @@ from drivers.transport.link import LinkLost, NoAnswer, now_s
 from drivers.transport.mailbox import IMAGES_RING
 from drivers.transport.options import read_options
 from drivers.transport.port import Port
+from drivers.transport.timebase import Pauses
 from hal.camera_settings import UNKNOWN, CameraSettings
 from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
@@ -159,6 +160,7 @@ class CameraV4l2(PortDevice[Image]):
         self._failures = 0
         self._rate_hz = options.rate_hz
         self._settings = UNKNOWN
+        self._pauses = Pauses(longest_s=1.0 / options.rate_hz)
         opener = open_grabber or (lambda: Capture(options, context.name))
         self.port: Port[Grabber] = Port(context.name, open_link=opener, tenant=self)
 
@@ -177,13 +179,15 @@ class CameraV4l2(PortDevice[Image]):
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
         """Return a frame whose exposure began after this call.
 
-        Its stamp is the earliest possible: one period before the kernel's stamp, or before arrival if there is none.
+        Its stamp is the earliest possible: one period before the kernel's stamp, or before arrival if there is none. Without
+        the kernel's stamp a frame that ends a pause is left out, because it may have been held up.
         """
         return self.newest(deadline, not_before_s=self.context.clock.now_s())
 
     def set_up(self, link: Grabber) -> None:
         """Take over what the camera has accepted (owner thread)."""
         self._failures = 0
+        self._pauses.reset()
         self._rate_hz, self._settings = link.rate_hz, link.settings
         self._check_size(link.size_px)
 
@@ -205,6 +209,9 @@ class CameraV4l2(PortDevice[Image]):
         self._failures = 0
         self._check_size((frame.shape[1], frame.shape[0]))
         captured_s = link.captured_s()
+        if self._pauses.may_be_held_up(arrived_s, 1) and captured_s is None:
+            self.errors += 1  # without the kernel's stamp nothing shows how old it is
+            return
         stamped_by: Literal["device", "arrival"] = "arrival" if captured_s is None else "device"
         if stamped_by != self._settings.stamped_by:
             self._settings = replace(self._settings, stamped_by=stamped_by)

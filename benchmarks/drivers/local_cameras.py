@@ -121,7 +121,8 @@ class ScriptedGrabber:
         """Do nothing: nobody else wants the camera."""
 
 
-def _v4l2(context: Context, far_side: ScriptedGrabbers) -> CameraV4l2:
+def v4l2_of(context: Context, far_side: ScriptedGrabbers) -> CameraV4l2:
+    """Return the driver with the scripted camera."""
     options = CameraV4l2Options(width_px=SIZE_PX[0], height_px=SIZE_PX[1], rate_hz=RATE_HZ)
     device = CameraV4l2(context, options, far_side.open)
     device.port.start()
@@ -129,7 +130,7 @@ def _v4l2(context: Context, far_side: ScriptedGrabbers) -> CameraV4l2:
     return device
 
 
-FRAMES, PERIOD_S, FIRST_MM, SHAPE = 60, 0.01, 1000, (48, 64)
+FRAMES, PERIOD_S, FIRST_MM, SHAPE = 24, 0.01, 1000, (48, 64)
 OF_RECORDINGS = (WireFault.DROP, WireFault.DUP, WireFault.SILENT)
 
 
@@ -211,7 +212,8 @@ def _is_picture(value: Image, backing: NumberedPictures) -> bool:
 
 
 def _taken_s(value: Image, backing: NumberedPictures) -> float:
-    return backing.taken_s(value)
+    """Return when the exposure may have begun at the earliest, which is what the driver dates: a period before the capture."""
+    return backing.taken_s(value) - 1.0 / RATE_HZ
 
 
 LOCAL_BENCHES = (
@@ -226,7 +228,7 @@ LOCAL_BENCHES = (
             stamps="taken",
             far_options={"has_stamps": has_stamps},
             faults=WITHOUT_WIRE,
-            make=_v4l2,
+            make=v4l2_of,
         )
         for word, has_stamps in (("by stamps", True), ("by arrival", False))
     ),

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.drivers.camera_benches import NumberedPictures
+from benchmarks.drivers.local_cameras import ScriptedGrabbers, v4l2_of
 from drivers.camera_v4l2 import CameraV4l2, CameraV4l2Options
 from drivers.kinds.file_player import undamaged_png
 from hal.camera_settings import CameraSettings
@@ -193,6 +195,25 @@ def test_a_live_frame_began_after_the_call() -> None:
     asked_s = CLOCK.now_s()
     assert device.read_image(deadline=soon()).host_time_s >= asked_s
     device.close()
+
+
+@pytest.mark.parametrize("has_stamps", [False, True])
+def test_a_frame_that_was_held_up_is_given_only_with_the_kernel_s_stamp(has_stamps: bool) -> None:
+    far_side = ScriptedGrabbers(
+        pictures := NumberedPictures(), {"has_stamps": has_stamps, "fault": "delay", "every": 20}
+    )
+    device = v4l2_of(Context(name="camera"), far_side)
+    ages_s: dict[int, float] = {}
+
+    def is_over() -> bool:
+        for sample in device.mailbox.since(0)[0]:
+            ages_s[sample.sequence] = sample.host_time_s - pictures.taken_s(sample.value)
+        return far_side.plan.injected >= 2 and far_side.plan.frames % 20 > 5
+
+    until(is_over)
+    device.close()
+    far_side.close()
+    assert len(ages_s) >= 20 and max(ages_s.values()) < 0.1, "dated long after it was taken"
 
 
 def test_a_frame_that_lay_in_a_buffer_is_not_given_as_fresh_and_settings_are_reported() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import socket
 import sys
 import threading
 import warnings
@@ -22,6 +23,7 @@ from service.client import Client
 from service.core import Service, book_of
 from service.exposure import Exposure, unix_socket
 from service.operations import Operation
+from service.processes.console_host import ConsoleHost
 from service.processes.stop_host import bound_socket
 
 if TYPE_CHECKING:
@@ -43,6 +45,8 @@ class Options:
         record: file to record everything in.
         replay: starts a recorded cell in place of the devices; needs `inline`.
         exposure: where it listens, and how strangers are kept out.
+        console: whether to start the console, a process of its own that is a client of the HTTP API.
+        console_port: None for the second port after `port`, or for any free one where that is taken.
     """
 
     exposure: Exposure = field(default_factory=Exposure)
@@ -54,6 +58,8 @@ class Options:
     warm: bool = True
     record: Path | None = None
     replay: Callable[[], CellRuntime] | None = None
+    console: bool = False
+    console_port: int | None = None
 
 
 class Panelwright:
@@ -89,17 +95,26 @@ class Panelwright:
         self._server: HttpServer | None = None
         self._listeners = [listener, *for_proxy]
         self._hosts, self._origins = exposure.names_at(self.port)
+        console = _console_listener(options, self.port) if options.console and is_open_here(options) else None
+        readers = self._origins  # of the stop port's answers
+        if console is not None:
+            readers |= exposure.names_at(console.getsockname()[1])[1]
         self.service = Service(
             cell,
             _shipped() if operations is None else operations,
             runs_dir=options.runs_dir,
             stop_listener=stop_listener,
-            origins=tuple(sorted(self._origins)),
+            origins=tuple(sorted(readers)),
             inline=options.inline,
             partial=options.partial,
             record=options.record,
             replay=options.replay,
         )
+        self.console: ConsoleHost | None = None
+        if console is not None:
+            self.console = ConsoleHost(
+                console, service_url=self.url, stop_port=self.stop_port, report=self.service.note
+            )
 
     @property
     def url(self) -> str:
@@ -114,6 +129,11 @@ class Panelwright:
     def client(self, *, timeout_s: float = 40.0) -> Client:
         """Return a client of this service in this process, with a key of its own where keys are needed."""
         return Client(url=self.url, timeout_s=timeout_s, key=self.service.keys.own(), is_lasting=False)
+
+    @property
+    def console_url(self) -> str | None:
+        """Address of the console; None without one."""
+        return None if self.console is None else f"http://{self._exposure.stop_host}:{self.console.port}"
 
     @property
     def error(self) -> CellError | None:
@@ -161,6 +181,8 @@ class Panelwright:
     def close(self) -> None:
         """Stop the arm, end server and processes; takes a bounded time and is idempotent."""
         self._is_ending.set()
+        if self.console is not None:
+            self.console.close()
         if self._server is not None:
             self._server.stop()
         self.service.close()
@@ -187,7 +209,13 @@ class Panelwright:
         allowed = Allowed(hosts=self._hosts, origins=self._origins, proxies=exposure.proxied_from())
         # The stop port is on this machine only, so that other machines are told the address of the API, with a path.
         stop_url = self.stop_url if exposure.is_local else "/v1/stop"
-        app = create_app(self.service, allowed=allowed, stop_url=stop_url, cookie=f"panelwright_{self.port}")
+        app = create_app(
+            self.service,
+            allowed=allowed,
+            stop_url=stop_url,
+            cookie=f"panelwright_{self.port}",
+            console_url=self.console_url,
+        )
 
         def on_exit(why: str) -> None:
             # Latch the stop first, through the stop process; then tell every stream to end.
@@ -219,6 +247,8 @@ class Panelwright:
 
             self._error = Defect(f"the cell could not start: {error}", hint="the log has the traceback; report it")
         self._is_settled.set()
+        if self._error is None and self.console is not None:
+            self.console.start()  # after the cell, with which it would share the processor
         if self._error is not None and self._server is not None:
             self._server.stop()
 
@@ -232,6 +262,22 @@ def _warm() -> None:
     except Exception:  # raised again, with its context, at the first use
         log.warning("warming up failed", exc_info=True)
     freeze_loaded()
+
+
+def is_open_here(options: Options) -> bool:
+    """Return whether the console may be started: it cannot log in yet, so it serves this machine, and only without keys."""
+    exposure = options.exposure
+    return exposure.is_local and exposure.tls_cert is None and book_of(options.runs_dir).is_open
+
+
+def _console_listener(options: Options, port: int) -> socket.socket:
+    """Return the console's bound socket; a port that nobody asked for by number may be any free one."""
+    if options.console_port is not None:
+        return bound_socket(options.exposure.stop_host, options.console_port, option="--console-port")
+    try:
+        return bound_socket(options.exposure.stop_host, options.port and port + 2)
+    except CellError:
+        return bound_socket(options.exposure.stop_host, 0)
 
 
 def exit_on_sigterm() -> None:

@@ -63,6 +63,13 @@ def serve(
     record: Annotated[
         Path | None, typer.Option(help="Record everything that the devices are asked and answer in this file (MCAP).")
     ] = None,
+    console_page: Annotated[
+        bool, typer.Option("--console/--no-console", help="Start the console, the pages for operators.")
+    ] = True,
+    console_port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port of the console; the second port after --port if not given."),
+    ] = None,
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Start the cell and serve it until Ctrl-C, even if some devices are missing."""
@@ -91,9 +98,11 @@ def serve(
         partial=True,
         warm=warm,
         record=record,
+        console=console_page,
+        console_port=console_port,
     )
     panelwright = Panelwright(loaded, options)
-    threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()
+    threading.Thread(target=_announce, args=(panelwright, console_page), daemon=True).start()
     console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")
     run_to_end(panelwright)
 
@@ -115,11 +124,15 @@ def run_to_end(panelwright: Panelwright) -> NoReturn:
     leave(code)
 
 
-def _announce(panelwright: Panelwright) -> None:
+def _announce(panelwright: Panelwright, wants_console: bool) -> None:
     panelwright.wait_until_settled(START_PATIENCE_S)
     if panelwright.error is None and not panelwright.is_ending:  # not after Ctrl-C during the start
         for line in announcement(panelwright.service, panelwright.url, panelwright.stop_url):
             console.print(line)
+        if panelwright.console_url is not None:
+            console.print(f"panelwright: console at [bold]{panelwright.console_url}[/]")
+        elif wants_console:
+            console.print("panelwright: without the console, which cannot log in with a key yet; use the page instead")
 
 
 def announcement(service: Service, url: str, stop_url: str) -> Iterator[str]:

@@ -60,19 +60,23 @@ Poses are named `parent_from_child`; covariances are 6x6 over (dx, dy, dz, rx, r
 """
 
 
-def create_app(service: Service, *, allowed: Allowed, stop_url: str, cookie: str = "panelwright") -> ASGIApp:
+def create_app(
+    service: Service, *, allowed: Allowed, stop_url: str, cookie: str = "panelwright", console_url: str | None = None
+) -> ASGIApp:
     """Return the ASGI application of a service, which may still be starting.
 
     Args:
         allowed: hosts and origins that may use it.
         stop_url: address of the stop process, which is shown to clients.
         cookie: name of the cookie of a browser's session.
+        console_url: address of the console, likewise; None without one.
     """
     state = AppState(
         service=service,
         stop_url=stop_url,
         origins=allowed.origins,
         cookie=cookie,
+        console_url=console_url,
         hub=Hub(),
         metrics=Metrics(service),
         readings=ReadingDesk(lambda: service.supervisor.connection),

@@ -67,6 +67,7 @@ async def info(state: State) -> InfoView:
         seed=file.cell.seed,
         verbs=list(state.service.operations),
         stop_url=state.stop_url,
+        console_url=state.console_url,
         uptime_s=time.monotonic() - state.started_s,
         event_loop_lag_p99_s=state.metrics.lag_p99_s(),
         safety_note=SAFETY_NOTE,

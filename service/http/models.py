@@ -321,6 +321,7 @@ class InfoView(BaseModel):
     seed: int
     verbs: list[str]
     stop_url: str
+    console_url: Annotated[str | None, Field(description="address of the console; null if it was left out")] = None
     uptime_s: float
     event_loop_lag_p99_s: float
     safety_note: str

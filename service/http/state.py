@@ -37,6 +37,7 @@ class AppState:
         origins: web origins of this service's own pages, which alone may use a session.
         cookie: name of the session's cookie, which differs between services of one machine.
         sessions: the browsers that have logged in.
+        console_url: address of the console; None without one.
         pool: threads for device reads; when silent devices fill it, further reads are refused.
         control_pool: threads for cancel, reset and starting tasks, which no device read may delay.
         stop_pool: threads for nothing but stops, which no reset that waits may delay.
@@ -50,6 +51,7 @@ class AppState:
     origins: frozenset[str] = frozenset()
     cookie: str = "panelwright"
     sessions: Sessions = field(default_factory=Sessions)
+    console_url: str | None = None
     started_s: float = field(default_factory=time.monotonic)
     pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(DEVICE_THREADS, "device-read"))
     control_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(CONTROL_THREADS, "control"))

@@ -10,6 +10,9 @@ const banner = document.querySelector("#banner");
 
 function describe(info) {
   const where = info.mode === "sim" ? "simulated" : info.mode === "mixed" ? "partly simulated" : "real";
+  const link = document.querySelector("#console");
+  link.hidden = !info.console_url;
+  if (info.console_url) link.href = `http://${location.hostname}:${new URL(info.console_url).port}`;
   document.querySelector("#cell-line").textContent = `cell ${info.cell} · ${where} · panel ${info.panel} · seed ${info.seed}`;
 }
 

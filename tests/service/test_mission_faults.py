@@ -28,7 +28,7 @@ class Bench:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
         cell = str(ROOT / "cells" / "bench.toml")
-        options = ["--cell", cell, "--port", str(self.port), "--stop-port", "0", "--runs", str(folder)]
+        options = ["--cell", cell, "--port", str(self.port), "--stop-port", "0", "--no-console", "--runs", str(folder)]
         self.log = folder / "serve.log"
         with self.log.open("w") as log:
             command = [sys.executable, "-m", "service.cli", "serve", *options]

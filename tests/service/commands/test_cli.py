@@ -173,7 +173,7 @@ class Served:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
-        arguments = ["--cell", str(cell), "--port", str(self.port), "--stop-port", "0", "--no-warm"]
+        arguments = ["--cell", str(cell), "--port", str(self.port), "--stop-port", "0", "--no-warm", "--no-console"]
         arguments += ["--runs", str(folder / "runs")]
         self.log = folder / "serve.log"
         with self.log.open("w") as log, _hearing_hangups():

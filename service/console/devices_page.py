@@ -1,0 +1,119 @@
+"""Every device with what it says now: newest value, rate, age, faults, and connecting it again."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from nicegui import ui
+
+from hal.errors import CellError
+from service.console.mirror import Mirror
+from service.console.page_frame import Place, attempt, live, page_frame, picks, table
+from service.console.service_client import QUICK_S
+from service.console.texts import say
+from service.console.values import attribute
+
+READ_S = 1.0
+UNITS = {"m": "m", "n": "N", "nm": "N m", "rad": "rad", "s": "s"}
+PICTURES = ("camera", "range_scanner")
+
+
+def install(place: Place) -> None:
+    """Add the page at `/devices`."""
+
+    @ui.page("/devices", title=f"{say('nav.devices')} · {say('title')}")
+    def devices_page() -> None:
+        mirror = place.mirror
+        values = _Values(mirror)
+
+        async def connect(name: str) -> None:
+            if await attempt(lambda: mirror.client.post(f"/v1/devices/{name}/connect")) is not None:
+                ui.notify(say("device.connected", name=name), type="positive")
+            mirror.hurry()
+
+        with page_frame(place, "devices"), ui.element("section").classes("card"):
+            ui.html(say("devices.heading"), sanitize=False, tag="h2")
+            listed = ui.html("", sanitize=False)
+            live(picks(listed, connect, what="connect"), values.table)
+        ui.timer(READ_S, values.read)
+
+
+class _Values:
+    """The newest value of each device and how fast its readings come; read only while the page is open."""
+
+    def __init__(self, mirror: Mirror) -> None:
+        self._mirror = mirror
+        self._readings: dict[str, dict[str, Any]] = {}
+        self._rates_hz: dict[str, float] = {}
+
+    async def read(self) -> None:
+        """Read each device that has values, at most a second old."""
+        for device in self._mirror.said("devices", {"devices": []})["devices"]:
+            name = device["name"]
+            if device["kind"] in PICTURES or not device["health"]["connected"]:
+                continue
+            try:
+                path = f"/v1/devices/{name}/reading?max_age_s={READ_S}"
+                fresh = await self._mirror.client.get(path, timeout_s=QUICK_S)
+            except CellError:
+                self._readings.pop(name, None)
+                continue
+            before = self._readings.get(name)
+            if before is not None and fresh["host_time_s"] > before["host_time_s"]:
+                counted = fresh["sequence"] - before["sequence"]
+                self._rates_hz[name] = counted / (fresh["host_time_s"] - before["host_time_s"])
+            self._readings[name] = fresh
+
+    def table(self) -> str:
+        """Return all devices as an HTML table."""
+        devices = self._mirror.said("devices", {"devices": []})["devices"]
+        columns = ["device", "kind", "driver", "quality", "newest", "rate", "age", "fault"]
+        return table(columns, [self._row(device) for device in devices], name=say("devices.heading"))
+
+    def _row(self, device: dict[str, Any]) -> str:
+        name, health = device["name"], device["health"]
+        reading, rate_hz = self._readings.get(name), self._rates_hz.get(name)
+        is_good = health["connected"] and health["quality"] == "valid"
+        quality = say("device.good") if is_good else health["quality"] if health["connected"] else say("device.gone")
+        fault = health["detail"] or ("" if health["cause"] == "none" else health["cause"])
+        counts = say("device.errors", errors=health["errors"], reconnects=health["reconnects"])
+        again = "" if health["connected"] else (
+            f'<button type="button" class="plain" data-connect="{name}">{say("device.connect")}</button>'
+        )  # fmt: skip
+        value = say("device.picture") if device["kind"] in PICTURES else in_words(reading["value"]) if reading else "–"
+        rate = (
+            "–"
+            if rate_hz is None
+            else say("device.rate", rate=f"{rate_hz:.0f}")
+            if rate_hz > 0
+            else say("device.no_rate")
+        )
+        aged = "–" if reading is None or reading["age_s"] is None else f"{reading['age_s']:.2f} s"
+        return (
+            f"<tr><td><b>{attribute(name)}</b></td><td>{attribute(device['kind'].replace('_', ' '))}</td>"
+            f'<td class="quiet">{attribute(device["driver"])}</td>'
+            f'<td class="{"good" if is_good else "bad"}">{attribute(quality)}</td><td>{attribute(value)}</td><td>{rate}</td>'
+            f'<td>{aged}</td><td>{attribute(fault)} <span class="quiet">{counts}</span> {again}</td></tr>'
+        )
+
+
+def in_words(value: Any) -> str:
+    """Return a device's value as short text: numbers to four digits, angles of joints in degrees."""
+    if isinstance(value, dict):
+        if "position_rad" in value:
+            return " ".join(f"{math.degrees(angle):.1f}°" for angle in value["position_rad"])
+        return ", ".join(_named(key, part) for key, part in value.items())[:160]
+    if isinstance(value, bool):
+        return say("yes" if value else "no")
+    if isinstance(value, list):
+        return " ".join(in_words(part) for part in value)[:160]
+    return f"{value:.4g}" if isinstance(value, float) else "–" if value is None else str(value)
+
+
+def _named(key: str, value: Any) -> str:
+    """Return one part of a value with its name and, behind the number, its unit."""
+    name, _, unit = key.rpartition("_")
+    if unit in UNITS:
+        return f"{name.replace('_', ' ')} {in_words(value)} {UNITS[unit]}"
+    return f"{key.removeprefix('is_').replace('_', ' ')} {in_words(value)}"

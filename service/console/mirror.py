@@ -1,0 +1,157 @@
+"""Keeps the newest answers of the service for all browsers together, so that ten of them ask no more often than one."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import Any
+
+from hal.errors import CellError
+from hal.panel import Panel
+from service.client import FINAL
+from service.console.service_client import QUICK_S, ServiceClient
+
+TICK_S = 0.25
+IDLE_S = 15.0  # nobody has looked for so long: ask less
+PERIODS_S = {
+    "ready": 1.0, "tasks": 0.5, "history": 1.0, "alarms": 1.0, "devices": 2.0, "frames": 1.0, "lease": 2.0,
+    "stop": 1.0, "missions": 5.0, "calibrations": 10.0, "info": 10.0, "panel": 10.0, "arm": 0.25, "arm_model": 30.0,
+}  # fmt: skip
+PATHS = {
+    "ready": "/readyz", "tasks": "/v1/tasks?limit=30", "history": "/v1/history", "alarms": "/v1/alarms",
+    "devices": "/v1/devices", "frames": "/v1/frames", "lease": "/v1/lease", "stop": "/v1/stop", "missions": "/v1/missions",
+    "calibrations": "/v1/calibrations", "info": "/v1/info", "panel": "/v1/panel",
+}  # fmt: skip
+ON_DEMAND = ("arm", "arm_model")
+
+
+class Mirror:
+    """What the service said last, by topic, and the events of the tasks that run. It can be thrown away at any time.
+
+    Attributes:
+        problem: why the service could not be asked; None when it answers.
+        events: events of a task by its id, from its beginning.
+    """
+
+    def __init__(self, client: ServiceClient) -> None:
+        self.client = client
+        self.problem: CellError | None = None
+        self.events: dict[str, list[dict[str, Any]]] = {}
+        self._said: dict[str, Any] = {}
+        self._due_s: dict[str, float] = {}
+        self._looked_s = time.monotonic()
+        self._wanted_s: dict[str, float] = {}
+        self._followers: dict[str, asyncio.Task[None]] = {}
+        self._panel: tuple[Any, Panel] | None = None
+        self._loop: asyncio.Task[None] | None = None
+        self._asking: set[asyncio.Task[None]] = set()
+
+    def start(self) -> None:
+        """Begin to ask, in the running event loop."""
+        self._loop = asyncio.create_task(self._run())
+
+    async def close(self) -> None:
+        """End all requests."""
+        for task in [self._loop, *self._followers.values(), *self._asking]:
+            if task is not None:
+                task.cancel()
+        await self.client.close()
+
+    def said(self, topic: str, otherwise: Any = None) -> Any:
+        """Return the newest answer of a topic; a topic that only some pages need is asked for while they do."""
+        self._looked_s = self._wanted_s[topic] = time.monotonic()
+        return self._said.get(topic, otherwise)
+
+    @property
+    def panel(self) -> Panel | None:
+        """The panel of the cell; None until the service has answered."""
+        plain = self.said("panel")
+        if plain is None:
+            return None
+        if self._panel is None or self._panel[0] is not plain:
+            import json
+
+            self._panel = (plain, Panel.model_validate_json(json.dumps(plain)))
+        return self._panel[1]
+
+    @property
+    def tasks(self) -> list[dict[str, Any]]:
+        """The kept tasks, newest first."""
+        found: list[dict[str, Any]] = self.said("tasks", {"tasks": []})["tasks"]
+        return found
+
+    @property
+    def active(self) -> dict[str, Any] | None:
+        """The task that runs or waits; None if nothing does."""
+        return next((task for task in self.tasks if task["state"] not in FINAL), None)
+
+    def readings(self) -> dict[str, dict[str, Any]]:
+        """Return the newest reading of each object, by its name."""
+        return {one["object"]: one for one in self.said("history", {"newest": []})["newest"]}
+
+    def alarms(self) -> dict[str, dict[str, Any]]:
+        """Return the first alarm of each object that has one, by its name."""
+        found: dict[str, dict[str, Any]] = {}
+        for alarm in self.said("alarms", {"alarms": []})["alarms"]:
+            found.setdefault(alarm["object"], alarm)
+        return found
+
+    def hurry(self) -> None:
+        """Ask for everything at the next tick, because something was done."""
+        self._due_s.clear()
+
+    async def _run(self) -> None:
+        while True:
+            now_s = time.monotonic()
+            if now_s - self._looked_s < IDLE_S or self.problem is not None or "info" not in self._said:
+                for topic in self._topics_due(now_s):
+                    self._due_s[topic] = now_s + QUICK_S + 1.0  # not again before it has answered
+                    task = asyncio.create_task(self._ask(topic))
+                    self._asking.add(task)
+                    task.add_done_callback(self._asking.discard)
+            await asyncio.sleep(TICK_S)
+
+    def _topics_due(self, now_s: float) -> list[str]:
+        return [
+            topic
+            for topic in PERIODS_S
+            if now_s >= self._due_s.get(topic, 0.0)
+            and (topic not in ON_DEMAND or now_s - self._wanted_s.get(topic, -IDLE_S) < IDLE_S)
+        ]
+
+    async def _ask(self, topic: str) -> None:
+        try:
+            self._said[topic] = await self.client.get(self._path(topic), timeout_s=QUICK_S)
+            self.problem = None
+        except CellError as error:
+            if topic in ("info", "ready"):  # a single topic may be refused, for example an arm that is missing
+                self.problem = error
+        finally:
+            self._due_s[topic] = time.monotonic() + PERIODS_S[topic]
+        if topic == "tasks":
+            self._follow_active()
+
+    def _path(self, topic: str) -> str:
+        if topic not in ON_DEMAND:
+            return PATHS[topic]
+        devices = self._said.get("devices", {"devices": []})["devices"]
+        arm = next((one["name"] for one in devices if one["kind"] == "arm"), "arm")
+        return f"/v1/devices/{arm}/reading?max_age_s=0.1" if topic == "arm" else f"/v1/devices/{arm}"
+
+    def _follow_active(self) -> None:
+        for task in self._said["tasks"]["tasks"][:5]:
+            if task["id"] not in self.events:
+                self.events[task["id"]] = []
+                self._followers[task["id"]] = asyncio.create_task(self._follow(task["id"]))
+        for old in list(self.events)[:-30]:
+            self.events.pop(old)
+            follower = self._followers.pop(old, None)
+            if follower is not None:
+                follower.cancel()
+
+    async def _follow(self, task_id: str) -> None:
+        with contextlib.suppress(CellError):
+            async for event in self.client.events(task_id):
+                self.events.setdefault(task_id, []).append(event)
+        self.hurry()  # its readings are new

@@ -1,0 +1,148 @@
+"""What all pages share: the head with the stop, the way to the other pages, what is wrong now, and parts of HTML."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from nicegui import ui
+
+from hal.errors import CellError
+from service.console.mirror import Mirror
+from service.console.texts import say, word
+from service.console.values import STALE_S, attribute
+
+PAGES = {"panel": "/", "missions": "/missions", "devices": "/devices", "setup": "/setup", "cell": "/cell"}
+REFRESH_S = 0.25
+# A click or the Enter key on something that carries the name of an object.
+PICK = (
+    "(event) => { if (event.type === 'keydown' && !['Enter', ' '].includes(event.key)) return;"
+    " const one = event.target.closest('[data-%s]'); if (!one) return; event.preventDefault(); emit(one.dataset.%s); }"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """What the pages need: the mirror of the service, and the console's own port and the stop port."""
+
+    mirror: Mirror
+    port: int
+    stop_port: int
+
+
+@contextmanager
+def page_frame(place: Place, current: str) -> Iterator[None]:
+    """Lay out one page: what is built inside becomes its main part."""
+    ui.add_head_html('<link rel="stylesheet" href="/web/console.css">')
+    ui.add_body_html(stop_box(place))
+    with ui.element("div").classes("top"):
+        heading = ui.html("", sanitize=False)
+        links = "".join(
+            f'<a href="{path}"{" aria-current=page" if name == current else ""}>{say(f"nav.{name}")}</a>'
+            for name, path in PAGES.items()
+        )
+        ui.html(links, sanitize=False, tag="nav").props(f'aria-label="{say("nav")}"')
+    with ui.element("div").classes("main"):  # NiceGUI lays it out inside of its own <main>
+        banner = ui.html("", sanitize=False).classes("banner").props("role=alert")
+        yield
+    live(heading, lambda: _heading(place.mirror))
+    live(banner, lambda: trouble(place.mirror))
+
+
+def stop_box(place: Place) -> str:
+    """Return the stop's own HTML and script, which need nothing of the console once they are loaded."""
+    words = {key: say(f"stop.{key}") for key in ("stopping", "stopped", "clear", "silent")}
+    return (
+        f'<aside id="stop-box" aria-label="{say("stop.label")}" data-latched="unknown" data-own-port="{place.port}" '
+        f'data-stop-port="{place.stop_port}" data-utc="{time.time():.2f}" data-stale-s="{STALE_S:.0f}" '
+        f'data-words="{attribute(json.dumps(words))}">'
+        f'<p id="stop-line" role="status">{say("stop.unknown")}</p>'
+        f'<button id="stop-reset" type="button" hidden>{say("stop.reset")}</button>'
+        f'<button id="stop-button" type="button" title="{attribute(say("stop.title"))}">{say("stop.label")}</button></aside>'
+        '<script src="/web/stop.js"></script><script src="/web/page.js"></script>'
+    )
+
+
+def live(element: Any, render: Callable[[], str], *, every_s: float = REFRESH_S) -> None:
+    """Show what `render` returns and keep it up to date; nothing is sent while it stays the same."""
+
+    def renew() -> None:
+        content = render()
+        if content != element.content:
+            element.set_content(content)
+
+    renew()
+    ui.timer(every_s, renew)
+
+
+def button(label: str, on_click: Callable[[], Any], *, look: str = "do") -> Any:
+    """Return a plain button."""
+    return (
+        ui.html(attribute(label), sanitize=False, tag="button")
+        .classes(look)
+        .props("type=button")
+        .on("click", lambda _: on_click())
+    )
+
+
+def picks(element: Any, on_pick: Callable[[str], Any], *, what: str = "object") -> Any:
+    """Call `on_pick` with the name that a clicked part of the element carries in its `data-` attribute."""
+    for kind in ("click", "keydown"):
+        element.on(kind, lambda event: on_pick(str(event.args)), js_handler=PICK % (what, what))
+    return element
+
+
+async def attempt(deed: Callable[[], Awaitable[Any]]) -> Any:
+    """Do something with the service; a refusal is shown as a sentence with what to do. Returns None then."""
+    try:
+        return await deed()
+    except CellError as error:
+        ui.notify(f"{error.what}. {say('try', hint=error.hint)}", type="negative", multi_line=True, timeout=12_000)
+        return None
+
+
+def trouble(mirror: Mirror) -> str:
+    """Return what keeps the cell from working, as HTML; empty if nothing does."""
+    if mirror.problem is not None:
+        return attribute(f"{mirror.problem.what}: {mirror.problem.hint}")
+    ready, lines = mirror.said("ready"), []
+    if ready is not None and not ready["is_running"]:
+        detail = next((one["detail"] for one in ready["processes"] if one["detail"]), say("starting"))
+        lines.append(say("not_running", detail=detail))
+    for one in (ready or {"missing": []})["missing"]:
+        lost = ", ".join(word("verb", verb) for verb in one["lost"]) or say("only_readings")
+        lines.append(say("without", device=one["device"], why=one["why"], lost=lost))
+    lease = mirror.said("lease")
+    if lease is not None and lease["is_held"]:
+        lines.append(say("lease.held", holder=lease["holder"]))
+    return "<br>".join(attribute(line) for line in lines)
+
+
+def table(columns: list[str], rows: list[str], *, name: str, empty: str = "") -> str:
+    """Return an HTML table called `name`; `columns` are keys of texts, `rows` are HTML."""
+    if not rows:
+        return f'<p class="quiet">{attribute(empty)}</p>'
+    head = "".join(f'<th scope="col">{attribute(say(f"column.{name}"))}</th>' for name in columns)
+    body = f'<table class="list"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
+    return f'<div class="scroll" tabindex="0" role="group" aria-label="{attribute(name)}">{body}</div>'
+
+
+def clock(seconds: float | None) -> str:
+    """Return a moment for people, in the time of the cell's machine."""
+    if seconds is None:
+        return "–"
+    moment = time.localtime(seconds)
+    is_today = moment[:3] == time.localtime()[:3]
+    return time.strftime("%H:%M:%S" if is_today else "%Y-%m-%d %H:%M", moment)
+
+
+def _heading(mirror: Mirror) -> str:
+    info = mirror.said("info")
+    line = say("cell.unknown")
+    if info is not None:
+        line = say("cell", cell=info["cell"], mode=word("mode", info["mode"]), panel=info["panel"])
+    return f'<h1>panelwright</h1><span class="quiet">{attribute(line)}</span>'

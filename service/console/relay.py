@@ -1,0 +1,66 @@
+"""Passes on to the browser what only the service has: pictures, crops, reports, and the stop as its second way."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+
+from hal.errors import CellError
+from service.client import ApiError
+from service.console.service_client import QUICK_S, ServiceClient
+
+# What a page may fetch through the console: read only, and nothing that moves.
+PICTURES = re.compile(
+    r"/v1/(devices/[a-z0-9_]{1,64}/reading|history/[a-z0-9_]{1,41}/crops/[0-9a-f]{64}"
+    r"|missions/[A-Za-z0-9_.-]{1,100}/[A-Za-z0-9_.-]{1,100}|tasks/[0-9a-z]{1,64}/artefacts/[A-Za-z0-9_.-]{1,100})"
+)
+MEDIA = {".html": "text/html; charset=utf-8", ".json": "application/json", ".pdf": "application/pdf"}
+REPORT_POLICY = "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline' 'self'; frame-ancestors 'none'"
+
+
+def install_relay(app: FastAPI, client: ServiceClient) -> None:
+    """Add the routes under `/relay` to the console's application."""
+
+    @app.get("/relay/stop")
+    async def stop_state() -> Response:
+        return await _passed_on(client, "GET", "/v1/stop", timeout_s=QUICK_S)
+
+    @app.post("/relay/stop")
+    async def stop() -> Response:
+        return await _passed_on(client, "POST", "/v1/stop", timeout_s=QUICK_S)
+
+    @app.post("/relay/stop/reset")
+    async def reset(request: Request) -> Response:
+        return await _passed_on(client, "POST", "/v1/stop/reset", await request.json())
+
+    @app.get("/relay/{path:path}")
+    async def file(path: str) -> Response:
+        wanted = f"/{path}"
+        if not PICTURES.fullmatch(wanted):
+            return Response("there is nothing here\n", 404, media_type="text/plain")
+        query = "?format=png&max_age_s=0.5" if wanted.endswith("/reading") else ""
+        suffix = wanted[wanted.rfind(".") :] if "." in wanted.rpartition("/")[2] else ""
+        return await _passed_on(client, "GET", wanted + query, media=MEDIA.get(suffix, "image/png"))
+
+
+async def _passed_on(
+    client: ServiceClient,
+    method: str,
+    path: str,
+    body: Any = None,
+    *,
+    media: str = "application/json",
+    timeout_s: float = 40.0,
+) -> Response:
+    headers = {"Cache-Control": "no-store"}
+    if media.startswith("text/html"):
+        headers["Content-Security-Policy"] = REPORT_POLICY
+    try:
+        data = await client.fetch(method, path, body, timeout_s=timeout_s)
+    except ApiError as error:
+        return Response(f"{error.what}\n{error.hint}\n", 502, media_type="text/plain", headers=headers)
+    except CellError as error:
+        return Response(f"{error.what}\n{error.hint}\n", 503, media_type="text/plain", headers=headers)
+    return Response(data, media_type=media, headers=headers)

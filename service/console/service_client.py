@@ -1,0 +1,76 @@
+"""Asks the HTTP API without waiting in the event loop; an error becomes a sentence for people."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+import httpx2
+
+from hal.errors import DeviceUnavailable
+from service.client import ApiError
+from service.console.texts import say
+
+TIMEOUT_S = 40.0
+QUICK_S = 3.0
+
+
+class ServiceClient:
+    """A client of one service.
+
+    Args:
+        url: its address, for example `http://127.0.0.1:8460`.
+        transport: carries the requests; None for the network.
+    """
+
+    def __init__(self, url: str, *, transport: httpx2.AsyncBaseTransport | None = None) -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx2.AsyncClient(base_url=self.url, timeout=TIMEOUT_S, trust_env=False, transport=transport)
+
+    async def get(self, path: str, *, timeout_s: float = TIMEOUT_S) -> Any:
+        """Return the JSON answer to a GET request.
+
+        Raises:
+            ApiError: the service answered with a problem.
+            DeviceUnavailable: it does not answer.
+        """
+        return json.loads(await self.fetch("GET", path, timeout_s=timeout_s))
+
+    async def post(self, path: str, body: Any = None) -> Any:
+        """Return the JSON answer to a POST request; errors as for `get`."""
+        return json.loads(await self.fetch("POST", path, body))
+
+    async def fetch(self, method: str, path: str, body: Any = None, *, timeout_s: float = TIMEOUT_S) -> bytes:
+        """Return the bytes of an answer; errors as for `get`."""
+        try:
+            answer = await self._http.request(method, path, json=body, timeout=timeout_s)
+        except httpx2.RequestError as error:
+            raise DeviceUnavailable(say("service.silent"), hint=say("service.silent.hint")) from error
+        if answer.status_code >= httpx2.codes.BAD_REQUEST and path != "/readyz":
+            raise ApiError(_problem(answer.content, answer.status_code))
+        return answer.content
+
+    async def events(self, task_id: str) -> AsyncIterator[dict[str, Any]]:
+        """Yield the events of a task from its beginning until it ends or the connection is lost."""
+        headers = {"Accept": "text/event-stream"}
+        try:
+            async with self._http.stream("GET", f"/v1/tasks/{task_id}/events", headers=headers, timeout=None) as answer:
+                async for event in httpx2.EventSource(answer):
+                    yield json.loads(event.data)
+        except httpx2.RequestError:
+            return
+
+    async def close(self) -> None:
+        """Close its connections."""
+        await self._http.aclose()
+
+
+def _problem(data: bytes, status: int) -> dict[str, Any]:
+    try:
+        problem = json.loads(data)
+    except ValueError:
+        problem = None
+    return (
+        problem if isinstance(problem, dict) else {"title": "Problem", "detail": say("service.status", status=status)}
+    )

@@ -1,0 +1,96 @@
+"""Runs the console for the service in a process of its own, and starts it again when it ends."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from service.processes.child import Child
+
+MODULE = "service.console.process"  # named and not imported: the web framework stays out of this process
+SETTLED_S = 20.0  # a console that lived so long is started again at once
+LONGEST_PAUSE_S = 30.0
+log = logging.getLogger(__name__)
+
+
+class ConsoleHost:
+    """The console's process. It may die or be killed at any time: it holds nothing, and it is started again.
+
+    Args:
+        listener: bound socket of the console, which stays open between two processes, so that browsers wait.
+        service_url: address of the HTTP API.
+        stop_port: port of the stop process.
+        report: where unexpected ends are recorded.
+        module: what to run.
+    """
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        *,
+        service_url: str,
+        stop_port: int,
+        report: Callable[[str, dict[str, Any]], None],
+        module: str = MODULE,
+    ) -> None:
+        self._listener = listener
+        self._arguments = ["--fd", str(listener.fileno()), "--service", service_url, "--stop-port", str(stop_port)]
+        self._report = report
+        self._module = module
+        self._lock = threading.Lock()
+        self._is_closing = threading.Event()
+        self._is_ready = threading.Event()
+        self._child: Child | None = None
+        self._pause_s = 0.0
+        self.restarts = 0
+        self.port: int = listener.getsockname()[1]
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the console; None while there is none."""
+        child = self._child
+        return child.pid if child is not None and child.is_alive() else None
+
+    def start(self) -> None:
+        """Start the process; it answers a few seconds later."""
+        with self._lock:
+            if self._is_closing.is_set():
+                return
+            self._child = Child(
+                self._module,
+                self._arguments,
+                pass_fds=[self._listener.fileno()],
+                on_line=lambda _line: self._is_ready.set(),
+                on_exit=self._exited,
+            )
+
+    def wait_until_ready(self, timeout_s: float) -> bool:
+        """Wait until the newest process answers; returns whether it did in time."""
+        return self._is_ready.wait(timeout_s)
+
+    def close(self) -> None:
+        """End the process and close its port; a second call does nothing."""
+        with self._lock:
+            self._is_closing.set()
+            child = self._child
+        if child is not None:
+            child.end(grace_s=1.0)
+        self._listener.close()
+
+    def _exited(self, code: int) -> None:
+        self._is_ready.clear()
+        child = self._child
+        if self._is_closing.is_set() or child is None:
+            return
+        log.warning("the console ended with code %d; it is started again", code)
+        self._report("console-process-down", {"code": code})
+        lived_s = time.monotonic() - child.started_s
+        self._pause_s = 0.0 if lived_s > SETTLED_S else min(max(0.5, 2.0 * self._pause_s), LONGEST_PAUSE_S)
+        child.kill()
+        if not self._is_closing.wait(self._pause_s):
+            self.restarts += 1
+            self.start()

@@ -1,0 +1,206 @@
+"""Tests of the console in a real browser, beside a service of fakes. Skipped if there is no Chromium."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Error
+
+from hal.config import load_cell
+from hal.strict import Strict
+from service.operations import Operation, OperationContext
+from service.serve import Options, Panelwright
+from tests.service.browser import NEEDS_CHROMIUM, browser
+from tests.service.conftest import WriteCell
+from tests.service.history.test_store import reading
+from tests.service.verbs import OPERATIONS, EchoResult, HoldRequest, HoldResult, hold
+from tests.service.waiting import eventually
+
+__all__ = ["browser"]  # a fixture
+pytestmark = NEEDS_CHROMIUM
+SLIDER = """
+[[objects]]
+kind = "slider"
+name = "setpoint"
+label = "SETPOINT"
+position_m = [0.0, -0.12]
+travel_m = 0.1
+scale = { minimum = 0.0, maximum = 100.0, unit = "%", at_min = -0.05, at_max = 0.05 }
+"""
+PAGES = ("/", "/missions", "/devices", "/setup", "/cell")
+
+
+def until(page: Any, claim: str) -> None:
+    """Wait until a JavaScript condition holds; one about an element that is not there yet does not hold."""
+    probe = f"() => {{ try {{ return Boolean({claim}) }} catch {{ return false }} }}"
+
+    def holds() -> bool:
+        try:
+            return bool(page.evaluate(probe))
+        except Error:
+            return False  # the page is being loaded again, after a restart of the console
+
+    try:
+        eventually(holds, timeout_s=60.0)
+    except AssertionError:
+        raise AssertionError(f"{claim}; the page says: {page.inner_text('body')}") from None
+
+
+class SetRequest(Strict):
+    """What the console asks for when a slider is set or read."""
+
+    object: str = ""
+    objects: tuple[str, ...] = ()
+    value: float = 7.0
+
+
+class Cell:
+    """A service of fakes with its console. A slider that is set or read is in the history afterwards."""
+
+    def __init__(self, write_cell: WriteCell, folder: Any) -> None:
+        path = write_cell(robot=True)
+        (path.parent / "panel.toml").write_text((path.parent / "panel.toml").read_text() + SLIDER)
+        self.asked: list[SetRequest] = []
+        holds = Operation(
+            name="missions", request_model=HoldRequest, result_model=HoldResult, run=hold, summary="Hold", moves=True
+        )
+        sets = {
+            verb: Operation(
+                name=verb, request_model=SetRequest, result_model=EchoResult, run=self._set, summary="Set", moves=True
+            )
+            for verb in ("manipulate", "inspect")
+        }
+        options = Options(port=0, runs_dir=folder, inline=True, console=True)
+        self.service = Panelwright(load_cell(path), options, operations={**OPERATIONS, "missions": holds, **sets})
+        self.service.start()
+        assert self.console.wait_until_ready(150.0)
+
+    @property
+    def console(self) -> Any:
+        assert self.service.console is not None
+        return self.service.console
+
+    @property
+    def url(self) -> str:
+        return str(self.service.console_url)
+
+    def _set(self, context: OperationContext, request: SetRequest) -> EchoResult:
+        self.asked.append(request)
+        context.task.progress(0.5, "sliding")
+        self.record(request.value)
+        return EchoResult(text="", number=request.value, nothing=None)
+
+    def record(self, value: float) -> None:
+        """Store a reading of the slider."""
+        given = {
+            "object": "setpoint",
+            "kind": "slider",
+            "unit": "%",
+            "sigma": 0.3,
+            "confidence": 0.9,
+            "utc_s": time.time(),
+        }
+        self.service.service.history.add([reading(0, value, **given)])
+
+
+@pytest.fixture(scope="module")
+def cell(write_module_cell: WriteCell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    cell = Cell(write_module_cell, tmp_path_factory.mktemp("runs"))
+    yield cell
+    cell.service.close()
+
+
+@pytest.fixture(scope="module")
+def page(browser: Any, cell: Cell) -> Iterator[Any]:
+    tab = browser.new_page(viewport={"width": 1440, "height": 900})
+    tab.set_default_timeout(60_000)
+    faults: list[str] = []
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+    tab.goto(cell.url)
+    yield tab
+    assert faults == []
+
+
+def test_the_panel_shows_and_a_new_reading_appears_by_itself(page: Any, cell: Cell) -> None:
+    until(page, "document.querySelector('[data-object=setpoint] .value').textContent === 'not read yet'")
+    cell.record(41.5)
+    until(page, "document.querySelector('[data-object=setpoint] .value').textContent === '41.5 %'")
+    until(page, "document.querySelector('tr time').textContent.endsWith(' s')")
+    until(page, "document.querySelector('img[data-source]').naturalWidth === 64")
+
+
+def test_an_object_is_opened_read_and_set_only_after_a_yes(page: Any, cell: Cell) -> None:
+    cell.asked.clear()
+    page.click("g[data-object=setpoint]")
+    page.click("button:text-is('Read now')")
+    until(page, "document.querySelector('.dialog').textContent.includes('done. It shows 7.0 %')")
+    page.click("button:text-is('Set to …')")
+    page.fill(".dialog input", "300")
+    page.click(".dialog button:text-is('Set to …')")
+    until(page, "document.querySelector('.dialog').textContent.includes('Give a number from 0 to 100')")
+    page.fill(".dialog input", "62")
+    page.click(".dialog button:text-is('Set to …')")
+    until(page, "document.querySelector('.dialog').textContent.includes('works it from 7.0 % to 62 %')")
+    assert len(cell.asked) == 1, "nothing moves before the yes"
+    page.click("button:text-is('Yes, move')")
+    until(page, "document.querySelector('#dialog-value').textContent === '62.0 %'")
+    assert [(one.object, one.value) for one in cell.asked[1:]] == [("setpoint", 62.0)]
+    page.click("button:text-is('Close')")
+    page.wait_for_selector(".dialog", state="hidden")
+
+
+def test_a_mission_goes_on_while_the_console_is_killed_and_comes_back(page: Any, cell: Cell) -> None:
+    page.goto(f"{cell.url}/missions")
+    page.click("button:text-is('Run mission'):not([disabled])")
+    until(page, "document.querySelector('.steps').textContent.includes('holding')")
+    first = cell.console.pid
+    os.kill(first, signal.SIGKILL)
+    eventually(lambda: cell.console.pid not in (None, first))
+    task = cell.service.service.tasks.all()[0]
+    until(
+        page,
+        "document.querySelector('.bar') !== null && document.querySelector('.steps').textContent.includes('holding')",
+    )
+    assert task.state == "running"
+    page.click("button:text-is('Cancel'):not([disabled])")
+    until(page, "document.querySelector('.steps').textContent.includes('cancelled')")
+    assert not cell.service.service.supervisor.latch.is_set()
+
+
+def test_the_stop_works_while_the_console_hangs(page: Any, cell: Cell) -> None:
+    page.goto(cell.url)
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    pid = cell.console.pid
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        page.click("#stop-button")
+        until(page, "document.querySelector('#stop-box').dataset.latched === 'yes'")
+        assert cell.service.service.supervisor.latch.is_set()
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    page.click("#stop-reset:not([hidden])")
+    until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    assert not cell.service.service.supervisor.latch.is_set()
+
+
+@pytest.mark.parametrize(("width_px", "scheme"), [(1440, "light"), (390, "dark")])
+def test_every_page_fits_and_has_no_barrier(browser: Any, cell: Cell, width_px: int, scheme: str) -> None:
+    from axe_playwright_python.sync_playwright import Axe
+
+    context = browser.new_context(viewport={"width": width_px, "height": 844}, color_scheme=scheme, bypass_csp=True)
+    tab = context.new_page()
+    found: list[str] = []
+    for path in PAGES:
+        tab.goto(cell.url + path)
+        until(tab, "document.querySelector('.top .quiet').textContent.includes('panel fake')")
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width_px, path
+        assert tab.locator("#stop-button").bounding_box()["y"] < 844, "the stop is always in sight"
+        for fault in Axe().run(tab).response["violations"]:
+            found.append(f"{path} {fault['id']}: {fault['nodes'][0]['html'][:120]}")
+    context.close()
+    assert found == []

@@ -1,0 +1,190 @@
+"""Tests of what the console shows, without a browser: texts, values, drawing, set-up, arm, and who may ask."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
+from hal.panel import NumberGoal, Panel, load_panel
+from manipulation import Kinematics
+from service.console.cell_page import joint_frames
+from service.console.mirror import Mirror
+from service.console.object_dialog import history_html
+from service.console.own_page import is_own
+from service.console.panel_drawing import overlay_svg, panel_svg
+from service.console.relay import PICTURES
+from service.console.service_client import ServiceClient
+from service.console.setup_page import checks
+from service.console.texts import ENGLISH
+from service.console.values import limits_for_people, shown, sigma, target_for_api
+from service.jsonable import jsonable
+from tests.manipulation.arms import T3
+
+ROOT = Path(__file__).parents[3]
+LENS = CameraIntrinsics(width_px=640, height_px=480, fx_px=460.0, fy_px=460.0, cx_px=319.5, cy_px=239.5)
+
+
+@pytest.fixture(scope="module")
+def panel() -> Panel:
+    return load_panel(ROOT / "panels" / "bench.toml")
+
+
+def reading(name: str, **given: Any) -> dict[str, Any]:
+    """Return a reading as `GET /v1/history` gives it."""
+    plain = {"value": None, "unit": "", "sigma": None, "state": None, "text": None, "confidence": 0.95, "cause": ""}
+    return {"object": name, "quality": "valid", "utc_s": 1e9, "crop_url": None, **plain, **given}
+
+
+def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
+    told = ""
+    for file in sorted((ROOT / "service/console").glob("*.py")):
+        if file.name == "texts.py":
+            continue
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        told += "\n".join(
+            node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        )
+        for node in ast.walk(tree):
+            if (
+                isinstance(node, ast.Call)
+                and getattr(node.func, "id", "") == "say"
+                and isinstance(node.args[0], ast.Constant)
+            ):
+                assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
+    built = ("nav.", "mode.", "state.", "verb.", "column.", "stop.")  # keys that are put together
+    unused = [key for key in ENGLISH if not key.startswith(built) and not re.search(rf"(?m)^{re.escape(key)}$", told)]
+    assert unused == []
+
+
+def test_values_are_in_the_terms_of_their_object(panel: Panel) -> None:
+    pressure, bypass = panel.object("pressure"), panel.object("bypass")
+    assert shown(pressure, reading("pressure", value=0.67548, unit="bar", sigma=0.018)) == "0.68 bar"
+    assert sigma(pressure, reading("pressure", value=0.67548, unit="bar", sigma=0.018)) == "± 0.018"
+    assert (
+        shown(panel.object("temperature"), reading("temperature", value=159.3, text=" 159.3", unit="degC"))
+        == "159.3 °C"
+    )
+    assert shown(bypass, reading("bypass", value=math.pi / 2, unit="rad")) == "90°"
+    assert shown(panel.object("main_valve"), reading("main_valve", value=0.0, state="open")) == "open"
+    refused = reading("pressure", value=None, quality="invalid", cause="glare")
+    assert shown(pressure, refused) == "not readable", "no value of a refused reading may be seen"
+    assert shown(pressure, None) == "not read yet"
+
+
+def test_a_target_in_degrees_reaches_the_api_in_radians_and_within_its_limits(panel: Panel) -> None:
+    goal = panel.object("bypass").goal
+    assert isinstance(goal, NumberGoal)
+    low, high, unit = limits_for_people(goal)
+    assert (low, high, unit) == (-360, 360, "°")
+    assert target_for_api(goal, 90.0) == pytest.approx(math.pi / 2)
+    assert goal.checked("bypass", target_for_api(goal, high)) == goal.high, (
+        "360 degrees are a little more than the stop"
+    )
+
+
+def test_the_drawing_has_every_object_once_at_its_place_with_its_value(panel: Panel) -> None:
+    readings = {
+        "pressure": reading("pressure", value=5.0, unit="bar", sigma=0.01),
+        "flow": reading("flow", quality="invalid"),
+    }
+    drawn = ElementTree.fromstring(panel_svg(panel, readings, {}))  # noqa: S314 - made here
+    objects = {one.get("data-object"): one for one in drawn if one.get("data-object")}
+    assert sorted(objects) == sorted(one.name for one in panel.objects)
+    assert "5.00 bar" in (objects["pressure"].get("aria-label") or "")
+    assert "not readable" in (objects["flow"].get("aria-label") or "")
+    x, y = (float(v) for v in re.findall(r"-?[\d.]+", objects["pressure"].get("transform") or ""))
+    assert x / y == pytest.approx(-0.205 / -0.118, rel=1e-3), "y is down in a drawing"
+    needle = objects["pressure"].find("line")
+    assert needle is not None
+    assert float(needle.get("x2", "9")) == pytest.approx(0.0, abs=1e-6), "the middle of this scale is straight up"
+    assert float(needle.get("y2", "9")) < 0
+    assert objects["flow"].find("line") is None, "a refused reading has no needle"
+
+
+def test_a_value_that_looks_like_a_script_is_only_text(panel: Panel) -> None:
+    drawn = panel_svg(panel, {"mode": reading("mode", state='<script>"')}, {})
+    assert "<script" not in drawn
+    assert "<script" not in history_html(panel.object("mode"), [reading("mode", state="<script>")])
+
+
+def test_the_outlines_lie_where_the_lens_sees_the_objects(panel: Panel) -> None:
+    pose = RigidTransform.from_components([0.03, -0.02, 0.8], Rotation.from_euler("xyz", [math.pi + 0.1, 0.05, 0.2]))
+    drawn = ElementTree.fromstring(overlay_svg(panel, pose, LENS, {}))  # noqa: S314 - made here
+    one = next(item for item in drawn if item.get("data-object") == "start")
+    polygon = one.find("polygon")
+    assert polygon is not None
+    points = np.array([pair.split(",") for pair in polygon.get("points", "").split()], float)
+    middle = project(pose.apply([[*panel.object("start").position_m, 0.0]]), LENS)[0]
+    assert np.abs(points.mean(axis=0) - middle).max() < 0.5
+    behind = RigidTransform.from_components([0.0, 0.0, -0.8], Rotation.identity())
+    assert "polygon" not in overlay_svg(panel, behind, LENS, {}), "a panel behind the camera is not drawn"
+
+
+def test_the_drawn_arm_is_the_arm_that_plans() -> None:
+    arm = T3
+    told = jsonable(asdict(arm))
+    q_rad = np.array([0.3, 0.8, -0.9, 0.4, 1.1, -0.2])
+    flange = joint_frames(told["links"], q_rad.tolist())[-1]
+    assert np.allclose(flange.as_matrix(), Kinematics.of(arm).flange(q_rad).as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("headers", "is_allowed"),
+    [
+        ({"host": "127.0.0.1:8462"}, True),
+        ({"host": "localhost:9000", "origin": "http://localhost:9000"}, True),  # through ssh -L
+        ({"host": "[::1]:8462"}, True),
+        ({"host": "evil.example:8462"}, False),  # DNS rebinding
+        ({"host": "127.0.0.1:8462", "origin": "http://evil.example"}, False),
+        ({"host": "127.0.0.1:8462", "origin": "null"}, False),
+        ({"host": "127.0.0.1:8462", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, False),
+        ({"host": "127.0.0.1:8462", "sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}, True),  # a link
+        ({}, False),
+    ],
+)
+def test_only_the_own_page_may_use_the_console(headers: dict[str, str], is_allowed: bool) -> None:
+    assert is_own(headers) is is_allowed
+
+
+@pytest.mark.parametrize(
+    ("path", "is_passed"),
+    [
+        ("/v1/devices/wrist_camera/reading", True),
+        (f"/v1/history/pressure/crops/{'a' * 64}", True),
+        ("/v1/missions/20261123T081014-7c/report.html", True),
+        ("/v1/stop/reset", False),
+        ("/v1/lease", False),
+        ("/v1/missions/../lease", False),
+        ("/v1/devices/arm/reading?format=npz", False),
+    ],
+)
+def test_the_relay_passes_on_pictures_and_reports_only(path: str, is_passed: bool) -> None:
+    assert (PICTURES.fullmatch(path) is not None) is is_passed
+
+
+def test_the_set_up_names_what_is_missing_and_the_one_next_step() -> None:
+    mirror = Mirror(ServiceClient("http://127.0.0.1:1"))
+    assert next(checks(mirror)).fix, "before the service answers, its start is the next step"
+    lost = {"device": "arm", "why": "no answer", "hint": "plug it in", "lost": ["missions"]}
+    mirror._said = {
+        "ready": {"is_running": True, "missing": [lost], "processes": []},
+        "stop": {"is_latched": True},
+        "frames": {"frames": [{"child": "panel"}]},
+        "missions": {"missions": [{}]},
+    }
+    missing = [check for check in checks(mirror) if check.fix]
+    assert [check.path for check in missing] == ["/v1/devices/arm/connect", ""]
+    assert missing[0].fix == "arm: plug it in"
+    mirror._said |= {"ready": {"is_running": True, "missing": [], "processes": []}, "stop": {"is_latched": False}}
+    assert [check.fix for check in checks(mirror) if check.fix] == []

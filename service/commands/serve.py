@@ -41,6 +41,13 @@ Proxies = Annotated[
 ]
 UnixSocket = Annotated[Path | None, typer.Option(help="A socket for that proxy, beside the port.")]
 
+ConsolePage = Annotated[
+    bool, typer.Option("--console/--no-console", help="Start the console, the pages for operators.")
+]
+ConsolePort = Annotated[
+    int | None, typer.Option(min=0, max=65535, help="Port of the console; the second port after --port if not given.")
+]
+
 
 @app.command()
 def serve(
@@ -63,13 +70,8 @@ def serve(
     record: Annotated[
         Path | None, typer.Option(help="Record everything that the devices are asked and answer in this file (MCAP).")
     ] = None,
-    console_page: Annotated[
-        bool, typer.Option("--console/--no-console", help="Start the console, the pages for operators.")
-    ] = True,
-    console_port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="Port of the console; the second port after --port if not given."),
-    ] = None,
+    console_page: ConsolePage = True,
+    console_port: ConsolePort = None,
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Start the cell and serve it until Ctrl-C, even if some devices are missing."""

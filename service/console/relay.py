@@ -14,7 +14,8 @@ from service.console.service_client import QUICK_S, ServiceClient
 # What a page may fetch through the console: read only, and nothing that moves.
 PICTURES = re.compile(
     r"/v1/(devices/[a-z0-9_]{1,64}/reading|history/[a-z0-9_]{1,41}/crops/[0-9a-f]{64}"
-    r"|missions/[A-Za-z0-9_.-]{1,100}/[A-Za-z0-9_.-]{1,100}|tasks/[0-9a-z]{1,64}/artefacts/[A-Za-z0-9_.-]{1,100})"
+    r"|missions/[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}/[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
+    r"|tasks/[0-9a-z]{1,64}/artefacts/[A-Za-z0-9_][A-Za-z0-9_.-]{0,99})"
 )
 MEDIA = {".html": "text/html; charset=utf-8", ".json": "application/json", ".pdf": "application/pdf"}
 REPORT_POLICY = "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline' 'self'; frame-ancestors 'none'"

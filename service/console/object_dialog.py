@@ -88,16 +88,15 @@ class ObjectDialog:
             ui.html(attribute(say("object.read_says", label=label_of(one))), sanitize=False, tag="p").classes("quiet")
             with ui.element("div").classes("row"):
                 button(say("object.read"), self._read)
-                if one.goal is not None:
+                if one.goal is not None and not one.forbidden:
                     button(say("object.set"), self._ask_target, look="plain")
-            if one.goal is None:
-                ui.html(attribute(say("object.read_only", label=label_of(one))), sanitize=False, tag="p").classes(
-                    "quiet"
-                )
+            if one.goal is None or one.forbidden:
+                key = "object.read_only" if one.goal is None else "object.forbidden"
+                ui.html(attribute(say(key, label=label_of(one))), sanitize=False, tag="p").classes("quiet")
 
     def _ask_target(self) -> None:
         one = self._object
-        if one is None or one.goal is None:
+        if one is None or one.goal is None or one.forbidden:
             return
         goal = one.goal
         self._work.clear()
@@ -142,8 +141,16 @@ class ObjectDialog:
                 "role=alert"
             )
             body = {"object": one.name} if not keeps_state else {"object": one.name, one.goal.key: target}
+            again = None
+            if one.confirm:
+                again = ui.input(label=say("object.name_again", label=label_of(one), name=one.name)).props("outlined")
+
+            async def work() -> None:
+                named = {} if again is None else {"confirm": str(again.value or "-")}
+                await self._do("/v1/manipulate", {**body, **named})
+
             with ui.element("div").classes("row"):
-                button(say("object.yes"), lambda: self._do("/v1/manipulate", body), look="do danger")
+                button(say("object.yes"), work, look="do danger")
                 button(say("object.no"), self._offer, look="plain")
 
     async def _read(self) -> None:

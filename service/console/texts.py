@@ -73,6 +73,8 @@ ENGLISH = {
     "object.read_only": "{label} is only read: there is nothing to set.",
     "object.ask": "The arm drives to {label}, works it from {now} to {target}, and looks whether it got there.",
     "object.ask_once": "The arm drives to {label}; it is {target}, once.",
+    "object.forbidden": "The panel file forbids to work {label}.",
+    "object.name_again": "{label} is worked only when it is named again. Its name is {name}:",
     "object.yes": "Yes, move",
     "object.no": "No",
     "object.bad_number": "Give a number from {low} to {high}.",
@@ -86,8 +88,7 @@ ENGLISH = {
     "missions.heading": "Mission",
     "missions.run": "Run mission",
     "missions.cancel": "Cancel",
-    "missions.says": "The arm finds the panel, reads every object, touches the plate, and works one control of each kind. "
-    "It leaves a report.",
+    "missions.says": "The arm finds the panel and reads every object; nothing is touched. It leaves a report.",
     "missions.idle": "Nothing is running.",
     "missions.running": "{verb}: {percent} %",
     "missions.steps": "Steps",

@@ -52,8 +52,7 @@ class HttpServer:
             http=limited_protocol(load),
             log_level="warning",
             access_log=False,
-            loop="asyncio",  # not what happens to be installed: the limits below are those of h11
-            http="h11",
+            loop="asyncio",  # not what happens to be installed
             server_header=False,
             timeout_graceful_shutdown=GRACE_S,
             timeout_keep_alive=10,

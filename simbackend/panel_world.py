@@ -163,13 +163,14 @@ class PanelWorld:
         x, y, z = pose.apply([0, 0, z]).tolist()
         self.light_places.append((x, y, z))
 
-    def _load_urdf(self, name: str, text: str, pose: RigidTransform) -> int:
+    def _load_urdf(self, name: str, text: str, pose: RigidTransform, *, has_exact_cylinders: bool = False) -> int:
         path = self.folder / f"{name}.urdf"
         path.write_text(text, encoding="ascii")
         position, quaternion = _pose(pose)
-        body = self.engine.loadURDF(
-            str(path), position, quaternion, useFixedBase=True, flags=self.engine.URDF_USE_INERTIA_FROM_FILE
-        )
+        flags = self.engine.URDF_USE_INERTIA_FROM_FILE
+        if has_exact_cylinders:
+            flags |= self.engine.URDF_USE_IMPLICIT_CYLINDER
+        body = self.engine.loadURDF(str(path), position, quaternion, useFixedBase=True, flags=flags)
         self.bodies[name] = int(body)
         return int(body)
 
@@ -183,7 +184,7 @@ class PanelWorld:
             self._shines[name] = model.shine
         if not model.urdf:
             return
-        body = self._load_urdf(name, robot(model.urdf), pose)
+        body = self._load_urdf(name, robot(model.urdf), pose, has_exact_cylinders=model.has_exact_cylinders)
         if self.engine.getNumJoints(body):
             self.engine.resetJointState(body, JOINT, model.place)
             for link in (-1, JOINT):

@@ -26,7 +26,8 @@ class ButtonBody(Body[Button]):
         cap = shape(at(0, 0, h / 2), cylinder(r, h), PAINT[panel_object.colour])
         limits = (-travel_m, 0.0)
         return ObjectModel(
-            urdf=moving([cap], kind="prismatic", axis=(0, 0, 1), limits=limits, mass_kg=0.05, inertia_kg_m2=1e-4)
+            urdf=moving([cap], kind="prismatic", axis=(0, 0, 1), limits=limits, mass_kg=0.05, inertia_kg_m2=1e-4),
+            has_exact_cylinders=True,
         )
 
     def mechanism(self, engine: Any, body: int, panel_object: Button, start: Start, effort_ratio: float) -> Spring:

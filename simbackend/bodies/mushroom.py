@@ -31,7 +31,8 @@ class MushroomBody(Body[Mushroom]):
         ]
         limits = (-panel_object.travel_m, 0.0)
         return ObjectModel(
-            urdf=moving(parts, kind="prismatic", axis=(0, 0, 1), limits=limits, mass_kg=0.08, inertia_kg_m2=1e-4)
+            urdf=moving(parts, kind="prismatic", axis=(0, 0, 1), limits=limits, mass_kg=0.08, inertia_kg_m2=1e-4),
+            has_exact_cylinders=True,
         )
 
     def mechanism(self, engine: Any, body: int, panel_object: Mushroom, start: Start, effort_ratio: float) -> Spring:

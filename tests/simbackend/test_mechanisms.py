@@ -42,7 +42,9 @@ def load(engine: Engine, folder: Path, panel_object: Any, place: float = 0.0) ->
     model = body_of(panel_object.kind).model(panel_object, Start(place=place))
     path = folder / "part.urdf"
     path.write_text(robot(model.urdf), encoding="ascii")
-    body = int(engine.loadURDF(str(path), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE))
+    flags = engine.URDF_USE_INERTIA_FROM_FILE
+    flags |= engine.URDF_USE_IMPLICIT_CYLINDER if model.has_exact_cylinders else 0
+    body = int(engine.loadURDF(str(path), useFixedBase=True, flags=flags))
     engine.resetJointState(body, JOINT, place)
     return body
 
@@ -99,6 +101,18 @@ def button(engine: Engine, folder: Path, **changes: Any) -> Spring:
 def test_a_button_sinks_by_force_less_preload_over_stiffness(engine: Engine, tmp_path: Path, force_n: float) -> None:
     spring = button(engine, tmp_path, spring_n_per_m=1000.0, preload_n=2.0)
     assert push(engine, spring.body, -force_n, spring.drive) == pytest.approx(-(force_n - 2.0) / 1000.0, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    "cap", [Button(name="b", position_m=(0.0, 0.0), radius_m=0.012), Mushroom(name="m", position_m=(0.0, 0.0))]
+)
+def test_a_cap_is_met_at_the_height_that_it_has(engine: Engine, tmp_path: Path, cap: Button | Mushroom) -> None:
+    """Prisms instead of cylinders are met 1 mm above the cap, which told latched caps as released."""
+    body = load(engine, tmp_path, cap)
+    box = engine.createMultiBody(0, engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[0.003, 0.006, 0.03]))
+    engine.resetBasePositionAndOrientation(box, [0.002, 0.0, cap.height_m + 0.002 + 0.03], [0, 0, 0, 1])
+    gaps = [point[8] for point in engine.getClosestPoints(box, body, 0.02)]
+    assert min(gaps) == pytest.approx(0.002, abs=1e-4)
 
 
 def test_less_than_the_preload_moves_no_button(engine: Engine, tmp_path: Path) -> None:

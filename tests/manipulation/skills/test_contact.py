@@ -222,6 +222,13 @@ def test_an_onset_lies_between_the_start_of_the_move_and_the_first_force() -> No
     assert onset(depth, force, 0.01)[0] == 0.005
 
 
+def test_a_contact_begins_where_the_force_begins_and_not_where_a_spring_would_have_none() -> None:
+    """A cap on a spring with a preload of 1.1 N and 1.2 kN/m resists at once; the line through its force is zero 0.9 mm before."""
+    depth = np.linspace(0.0, 0.006, 51)
+    force = np.where(depth > 0.005, 1.1 + 1200.0 * (depth - 0.005), 0.0)
+    assert onset(depth, force, 0.006)[0] == pytest.approx(0.005, abs=1.5e-4)
+
+
 def test_no_force_at_all_answers_with_the_deepest_place() -> None:
     assert onset(np.linspace(0, 0.01, 50), np.zeros(50), 0.01) == (0.01, 0.0)
 

@@ -161,7 +161,7 @@ def _missing(rng: np.random.Generator) -> Drill:
     event = {"kind": "missing", "object": control}
     return Drill(
         kind="object missing", control=control, events=(event,), outcomes=("error", "missed"),
-        words=("not where", "not known", "no cap", "there is no", "not show"),
+        words=("not where", "not known", "no cap", "no bat", "there is no", "not show"),
     )  # fmt: skip
 
 

@@ -35,7 +35,7 @@ def button(
     """
     wanted = None if expected == PRESSED_ONCE else expected
     if push_button.lights_lamp is None and push_button.latching:
-        return press_latching(context, push_button, wanted, skill="button", releases=True)
+        return press_latching(context, push_button, wanted, skill="button", releases=True, verify=verify)
     if push_button.lights_lamp is None and wanted is not None:
         raise InvalidRequest(
             f"{push_button.name} springs back and works no lamp, so nothing could show that it is {wanted!r}",

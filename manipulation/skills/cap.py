@@ -150,27 +150,30 @@ def state_by_height(cap: Button | Mushroom, height_m: float, *, sigma_m: float) 
     return "released" if odds > 0 else "pressed"
 
 
-def state_by_touch(attempt: Attempt, cap: Button | Mushroom, first: Touch) -> str | None:
-    """Return the state of a touched cap; touches the plate beside it if the pose of the panel is too uncertain.
+def state_by_touch(
+    attempt: Attempt, cap: Button | Mushroom, first: Touch, *, in_doubt: str | None = None
+) -> tuple[str | None, bool]:
+    """Return the state of a touched cap, and whether the plate beside it was touched for that.
 
-    Returns None, with the hand still at the cap, if there is no place beside it that the hand can touch; after a touch of
-    the plate the hand is above the plate.
+    The plate is touched if the pose of the panel is too uncertain, or for the state `in_doubt`, which a height by the pose
+    alone does not prove. Without a place beside the cap that the hand can touch the hand stays at the cap; after a touch
+    of the plate it is above the plate. The state is None where no height tells it.
 
     Raises:
         SkillFailure: what was touched is lower than a cap can be (`missed`).
     """
     height_m, sigma_m = first.height_m, _height_sigma_m(attempt.context, cap)
-    state = state_by_height(cap, height_m, sigma_m=sigma_m)
-    if state is None:
+    state, is_beside = state_by_height(cap, height_m, sigma_m=sigma_m), False
+    if state is None or state == in_doubt:
         plate_m = _plate_height_m(attempt, cap)
         if plate_m is None:
-            return None
-        height_m, sigma_m = height_m - plate_m, FELT_SIGMA_M
+            return state, False
+        height_m, sigma_m, is_beside = height_m - plate_m, FELT_SIGMA_M, True
         state = state_by_height(cap, height_m, sigma_m=sigma_m)
     if height_m < cap.height_m - cap.travel_m - LOST_SIGMAS * sigma_m:
         what = f"what was touched stands {1e3 * height_m:.1f} mm out of the plate, lower than a pressed {cap.name}"
         raise SkillFailure(Outcome.MISSED, what)
-    return state
+    return state, is_beside
 
 
 def _down(attempt: Attempt, first: Touch, depth_m: float, *, limit_n: float) -> MotionReport:

@@ -14,11 +14,11 @@ def mushroom(
     target: str = "pressed",
     *,
     current: ObjectState | None = None,  # noqa: ARG001 - not needed, because the head's height is felt
-    verify: Verify | None = None,  # noqa: ARG001 - not needed either
+    verify: Verify | None = None,
 ) -> SkillReport:
     """Press the mushroom until it is felt to be latched.
 
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
-    return press_latching(context, cap, target, skill="mushroom", releases=False)
+    return press_latching(context, cap, target, skill="mushroom", releases=False, verify=verify)

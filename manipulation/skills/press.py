@@ -20,17 +20,24 @@ ENOUGH_SHARE = 0.8  # of the travel: a shorter push may have had no effect
 
 
 def press_latching(
-    context: SkillContext, cap: Button | Mushroom, target: str | None, *, skill: str, releases: bool
+    context: SkillContext,
+    cap: Button | Mushroom,
+    target: str | None,
+    *,
+    skill: str,
+    releases: bool,
+    verify: Verify | None = None,
 ) -> SkillReport:
     """Press a cap that latches until it is felt to be in the target state.
 
     The witness is the height of the cap, felt by a light touch before the push and when the cap leaves the fingertip
-    after it: a latched cap stays deeper. A cap that is felt to have the target state is not pressed, and stays
-    unverified. The mechanical estimate is how much deeper than before the cap stays, m.
+    after it: a latched cap stays deeper. A cap that is felt to have the target state is not pressed, and is done if a look
+    agrees with its height over the plate beside it. The mechanical estimate is how much deeper than before the cap stays, m.
 
     Args:
         target: `pressed` or `released`; None for the other state than it has.
         releases: whether a push releases a latched cap.
+        verify: the caller's look; only a cap that has the target state already is looked at.
 
     Raises:
         Unprovable: a latched cap stands hardly deeper than a released one.
@@ -46,7 +53,7 @@ def press_latching(
     tries = itertools.count()
 
     def stroke(attempt: Attempt) -> float:
-        return _latch(attempt, cap, target, releases=releases, is_firm=next(tries) > 0)
+        return _latch(attempt, cap, target, verify, releases=releases, is_firm=next(tries) > 0)
 
     return perform(
         context,
@@ -113,14 +120,20 @@ def press_once(
     )
 
 
-def _latch(attempt: Attempt, cap: Button | Mushroom, target: str | None, *, releases: bool, is_firm: bool) -> float:
+def _latch(
+    attempt: Attempt,
+    cap: Button | Mushroom,
+    target: str | None,
+    verify: Verify | None,
+    *,
+    releases: bool,
+    is_firm: bool,
+) -> float:
     """Feel the cap and press it until it is felt to have the target state; returns how much deeper it stays, m."""
     first = feeling.touch(attempt, cap)
-    before = feeling.state_by_touch(attempt, cap, first)
+    before, is_beside = feeling.state_by_touch(attempt, cap, first, in_doubt=target)
     if target is not None and before == target:
-        # One height with an error of the pose is no proof: in 2 of 16 sweeps it told the wrong state.
-        attempt.cause = f"it was felt to be {target} already and was not pressed; its height alone does not prove that"
-        attempt.leave()
+        _leave_there(attempt, cap, target, verify if is_beside else None)
         return 0.0
     if before == "pressed" and not releases:
         raise SkillFailure(Outcome.STALLED, "it is latched, and no push releases it")
@@ -141,6 +154,22 @@ def _latch(attempt: Attempt, cap: Button | Mushroom, target: str | None, *, rele
             _note(attempt, cap, before, f"it was felt to stay {1e3 * abs(deeper_m):.1f} mm {side} than before")
             return deeper_m
     raise SkillFailure(Outcome.STALLED, f"it was pressed {PUSHES} times and is {before}")
+
+
+def _leave_there(attempt: Attempt, cap: Button | Mushroom, target: str, verify: Verify | None) -> None:
+    """Leave a cap that is felt to have the target state; a look that agrees proves it.
+
+    Its height alone does not: by the pose of the panel it told the wrong state in 2 of 16 sweeps.
+    """
+    attempt.leave()
+    seen = None if verify is None else verify()
+    if seen is not None and seen.state == target:
+        _note(attempt, cap, target, f"it was felt and seen to be {target} already and was not pressed")
+        return
+    shown = "no look confirms it" if seen is None or seen.state is None else f"the look shows it {seen.state}"
+    attempt.cause = (
+        f"it was felt to be {target} already and was not pressed; its height alone does not prove that, and {shown}"
+    )
 
 
 def _note(attempt: Attempt, cap: Button | Mushroom, state: str, cause: str) -> None:

@@ -60,7 +60,7 @@ def perform(
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
         if outcome is Outcome.UNVERIFIED and seen is None:
-            cause += NO_READING if verify is None else REFUSED
+            cause += REFUSED if verify is not None else NO_READING if cause == ENDED else ""
             break
         if outcome is Outcome.UNVERIFIED:
             outcome, cause = Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"

@@ -62,6 +62,7 @@ class SkillReport:
         seen: the last read-back.
         attempts: how often the stroke was tried.
         peak_force_n: over all motions.
+        was_missed: whether a try did not meet the control where it was expected.
     """
 
     skill: str
@@ -76,6 +77,7 @@ class SkillReport:
     ended_s: float
     peak_force_n: float
     motions: tuple[MotionReport, ...]
+    was_missed: bool = False
 
     @property
     def is_done(self) -> bool:

@@ -44,7 +44,7 @@ def perform(
     attempt, started_s = Attempt(context), context.mover.state().stamp_s
     seen: ObjectState | None = None
     reached: float | None = None
-    outcome, cause, tries, is_met = Outcome.UNREACHABLE, "", 0, False
+    outcome, cause, tries, is_met, was_missed = Outcome.UNREACHABLE, "", 0, False, False
     for tries in range(1, attempts + 1):
         context.progress((tries - 1) / attempts, f"{skill} {object_name}: attempt {tries}")
         outcome, cause, reached = _try(attempt, stroke)
@@ -54,7 +54,7 @@ def perform(
         if outcome is Outcome.UNVERIFIED and attempt.felt is not None and is_reached(attempt.felt):
             outcome, seen = Outcome.DONE, attempt.felt
             break
-        is_met = is_met or outcome is not Outcome.MISSED
+        is_met, was_missed = is_met or outcome is not Outcome.MISSED, was_missed or outcome is Outcome.MISSED
         seen = None if verify is None else verify()
         if seen is not None and is_reached(seen) and is_met and not attempt.is_against:
             outcome, cause = Outcome.DONE, "the read-back confirms it"
@@ -75,7 +75,7 @@ def perform(
         skill=skill, object=object_name, target=target, outcome=outcome, cause=cause, reached=reached, seen=seen,
         attempts=tries, started_s=started_s, ended_s=context.mover.state().stamp_s,
         peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0),
-        motions=tuple(attempt.reports),
+        motions=tuple(attempt.reports), was_missed=was_missed,
     )  # fmt: skip
 
 

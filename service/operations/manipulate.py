@@ -56,7 +56,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     before, findings = _look_first(session, eye, panel_object)
     session.observer.told(eye.witness.name, text_of(panel_object, target))
     report = _operate(session, eye, panel_object, target, before)
-    if not report.is_done or eye.is_off_its_place:
+    if not report.is_done or eye.is_off_its_place or report.was_missed:
         report, found = _after_doubt(session, eye, panel_object, target, report)
         findings += found
     reached = report.is_done
@@ -147,7 +147,7 @@ def _after_doubt(
     """Look whether the panel has moved; if so, name it, and try a deed that has not succeeded once more.
 
     A control whose state is not known is tried again only if the hand has missed it, because a second stroke might undo
-    the first.
+    the first. What was seen of a panel that has moved was seen where it stood before, so it is looked at again.
     """
     if report.outcome is Outcome.UNREACHABLE:
         return report, []
@@ -155,9 +155,14 @@ def _after_doubt(
         shift = look_again(session, panel_object)
     except (PerceptionError, Unreachable) as error:
         return report, [f"the panel was not found again afterwards: {error.what}"]
-    if shift is None or report.is_done:
+    if shift is None or (report.is_done and eye.last is None):  # what was felt holds wherever the panel stands
         return report, [] if shift is None else [shift.finding]
     now = eye.before(is_fresh=True)
+    if report.is_done and now is not None and _shows(eye.witness, now, target):
+        return report, [shift.finding]
+    if report.is_done:
+        cause = f"the panel has moved, and a look at its new place does not show {text_of(panel_object, target)}"
+        return replace(report, outcome=Outcome.UNVERIFIED, cause=cause), [shift.finding]
     if report.outcome is not Outcome.MISSED and (now is None or report.outcome is Outcome.UNVERIFIED):
         return report, [shift.finding]
     again = _operate(session, eye, panel_object, target, now)
@@ -189,6 +194,11 @@ def other_than_shown(panel_object: PanelObject, readings: Mapping[str, ObjectRea
         raise InvalidRequest(f"{panel_object.name} is read only", hint="leave it out of the mission")
     shown = Shown() if reading is None else Shown(value=reading.value, state=reading.state, text=reading.text)
     return ActionBody.model_validate({"object": panel_object.name, goal.key: goal.other_than(shown)})
+
+
+def _shows(witness: PanelObject, reading: ObjectReading, target: str | float) -> bool:
+    goal = Shown(state=target) if isinstance(target, str) else Shown(value=target)
+    return witness.is_right(Shown(value=reading.value, state=reading.state), goal)
 
 
 def run_manipulate(session: Session, request: ManipulateRequest) -> ManipulateResult:

@@ -36,7 +36,7 @@ RELAXING = Compliance(
     max_offset_rad=0.5,
 )
 ONSET_N = 1.0  # above noise, drift and inertia in a slow move
-QUIET_N = 0.4  # a smaller force is noise: there was no contact yet
+QUIET_N, QUIET_M = 0.4, 0.00025  # a smaller force may be noise, or the first part of a contact, which is not longer
 COARSE_RAD = 5e-4  # joint steps of this size or more cause larger inertial forces than a light contact
 REST_S = 0.12  # vibration has decayed by then, and the mean over the second half resolves 0.1 N
 REST_RATIO = 0.4  # of the force that stopped the move; creeping pads and friction may reduce it this far
@@ -145,7 +145,8 @@ def onset(depth_m: Array, force_n: Array, deepest_m: float) -> tuple[float, floa
     # The line through the force of a spring with preload is zero up to 2 mm before the contact.
     quiet = np.flatnonzero(force_n[:first] < QUIET_N)
     free_m = float(depth_m[quiet[-1]]) if len(quiet) else float(depth_m[0])
-    return float(np.clip(-offset / slope, free_m, d[0])), float(slope)
+    earliest_m = max(float(depth_m[0]), free_m - min(QUIET_N / slope, QUIET_M))
+    return float(np.clip(-offset / slope, earliest_m, d[0])), float(slope)
 
 
 def step(depth_m: Array, force_n: Array) -> float:

@@ -86,10 +86,14 @@ def _post(url: str, alarm: str, deed: str, body: dict[str, Any]) -> None:
 
 
 def _table(found: list[dict[str, Any]]) -> Table:
-    table = Table("alarm", "state", "priority", "since", "what", "what to do", box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
+    for head in ("alarm", "state", "priority", "since"):
+        table.add_column(head, overflow="fold", no_wrap=head != "alarm")
+    table.add_column("what, and what to do")
     for one in found:
-        since = datetime.fromtimestamp(one["changed_s"], UTC).strftime("%Y-%m-%d %H:%M:%S") if one["changed_s"] else ""
+        since = datetime.fromtimestamp(one["changed_s"], UTC).strftime("%m-%d %H:%M") if one["changed_s"] else ""
         style = STYLES.get(one["state"], "dim")
-        words = (one["id"], one["state"], one["priority"], since, one["says"], one["what_to_do"])
+        says = "\n".join(words for words in (one["says"], one["what_to_do"]) if words)
+        words = (one["id"], one["state"], one["priority"], since, says)
         table.add_row(*(escape(word) for word in words), style=style)
     return table

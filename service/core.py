@@ -88,7 +88,7 @@ class Service:
         self.started_s = time.monotonic()
         self._allowed_places = AllowedPlaces.of(cell, runs_dir / RECORDINGS)
         state_dir = runs_dir / ".service"
-        self._recording = None if record is None else self._record(record, inline)
+        self.recording = None if record is None else self._record(record, inline)
         self.journal = Journal(state_dir / "journal.sqlite")
         self.history = self._open_history(state_dir / "history")
         self.alarms = self._open_alarms(state_dir / "alarms.json")
@@ -102,14 +102,14 @@ class Service:
             runs_dir=runs_dir,
             partial=partial,
             records=Records(note=self.note, commit=self.commit),
-            record=None if self._recording is None else self._recording.endpoint,
+            record=None if self.recording is None else self.recording.endpoint,
             replay=replay,
         )
         self.journal_watch = JournalWatch(self.journal, self._on_no_record)
-        recorder = self.journal if self._recording is None else self._recording.recorder(self.journal)
+        recorder = self.journal if self.recording is None else self.recording.recorder(self.journal)
         self.tasks = TaskStore(state_dir / "tasks", recorder=recorder, stop_motion=self._stop_motion)
-        if self._recording is not None:
-            self.tasks.subscribe(self._recording.on_task)
+        if self.recording is not None:
+            self.tasks.subscribe(self.recording.on_task)
         self.lease = LeaseDesk(
             ttl_s=cell.file.safety.lease_ttl_s,
             others=self.tasks.moving_for_others,
@@ -278,8 +278,8 @@ class Service:
         self.note("service-end", {})
         self.history.close()
         self.journal.close()
-        if self._recording is not None:
-            self._recording.close()
+        if self.recording is not None:
+            self.recording.close()
         self._folder_lock.close()
 
     def stop_quietly(self, source: str) -> None:
@@ -337,8 +337,8 @@ class Service:
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
         """Write an entry to the journal without waiting for the disk."""
-        if self._recording is not None:
-            self._recording.note(kind, data)
+        if self.recording is not None:
+            self.recording.note(kind, data)
         try:
             self.journal.note(kind, data)
         except CellError as error:
@@ -350,8 +350,8 @@ class Service:
         Raises:
             JournalError: it could not be written.
         """
-        if self._recording is not None:
-            self._recording.note(kind, data)
+        if self.recording is not None:
+            self.recording.note(kind, data)
         self.journal.append(kind, data, timeout_s=COMMIT_S)
 
     def _open_history(self, folder: Path) -> History:

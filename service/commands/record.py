@@ -37,8 +37,9 @@ def record(
 ) -> None:
     """Start a cell, run a whole mission on it, and record everything that its devices are asked and answer.
 
-    The exit code is 0 when the task succeeded; the recording is complete either way. To record until Ctrl-C whatever
-    clients do, use `panelwright serve --record FILE`. For the traffic of one device, see `panelwright devices record`.
+    The exit code is 0 when the task succeeded and was recorded to its end; the recording is kept either way. To record
+    until Ctrl-C whatever clients do, use `panelwright serve --record FILE`. For the traffic of one device, see
+    `panelwright devices record`.
     """
     from service.serve import Options, Panelwright, exit_on_sigterm
 
@@ -58,6 +59,10 @@ def record(
         finally:
             panelwright.close()
         console.print(f"[bold]{file}[/]: {contents(file)}")
+        recording = panelwright.service.recording
+        if recording is not None and recording.problem:
+            console.print(f"[red]the recording ended early[/]: {escape(recording.problem)}")
+            code = code or 1
         console.print(f"play it back: panelwright replay {file}   look at it: open it in Foxglove")
         leave(code)
 

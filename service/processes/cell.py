@@ -148,7 +148,7 @@ def _tap(record: Endpoint | None, clock: Clock, report: Report, closers: list[Ca
         return None
     from service.recording.tap import Tap
 
-    sender = record.sender(report)
+    sender = record.sender(report, waits=True)  # the control loop begins before the cell is described
     closers.append(sender.close)
     return Tap(sender=sender, clock=clock)
 

@@ -148,7 +148,7 @@ class Supervisor:
         return tuple(self._missing.values())
 
     def start(self) -> None:
-        """Start the cell and wait until it is ready; in a simulated cell, reset the latch afterwards.
+        """Start the cell and wait until it is ready; in a simulated or replayed cell, reset the latch afterwards.
 
         Raises:
             CellError: the cell could not start.
@@ -159,7 +159,8 @@ class Supervisor:
         except CellError as error:
             self._problem = error
             raise
-        if self.cell.file.cell.mode == "sim" and self.latch.state().count == begun:  # nobody stopped it meanwhile
+        moves_nothing_real = self.cell.file.cell.mode == "sim" or self._replay is not None
+        if moves_nothing_real and self.latch.state().count == begun:  # nobody stopped it meanwhile
             self.reset("supervisor: a simulated cell starts ready", seen_count=begun)
         if not self.inline:
             self._is_watched = True

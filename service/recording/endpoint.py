@@ -19,8 +19,11 @@ class Endpoint:
     address: str
     key: str
 
-    def sender(self, report: Report) -> Sender:
+    def sender(self, report: Report, *, waits: bool = False) -> Sender:
         """Return a sender to the recorder.
+
+        Args:
+            waits: see `Sender`.
 
         Raises:
             DeviceUnavailable: the recorder's process has ended.
@@ -29,4 +32,4 @@ class Endpoint:
         from service.recording.sender import Sender
 
         recorder = connect(self.address, bytes.fromhex(self.key), "recorder", gone_hint="see the log above")
-        return Sender(recorder.take, report=report)
+        return Sender(recorder.take, report=report, waits=waits)

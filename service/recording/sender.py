@@ -17,6 +17,7 @@ BATCH = 64  # rows; pickling more at once would keep the control loop from the i
 PAUSE_S = 0.02
 MOST_ROWS = 50_000  # some 20 s of a control loop in real time; beyond this rows are dropped and counted
 END_S = 5.0
+FAILED = "recording-failed"
 log = logging.getLogger(__name__)
 
 Take = Callable[[bytes], str]
@@ -45,17 +46,24 @@ class Sender:
     Args:
         take: see `Take`; called by this object's thread only.
         report: called once, with `recording-failed` and the cause, when the recording cannot go on.
+        waits: whether nothing is sent before `begin`; what is put meanwhile follows it.
     """
 
-    def __init__(self, take: Take, *, report: Callable[[str, dict[str, Any]], None]) -> None:
+    def __init__(self, take: Take, *, report: Callable[[str, dict[str, Any]], None], waits: bool = False) -> None:
         self._take = take
         self._report = report
         self._waiting: deque[Any] = deque()
         self._dropped = 0
         self._is_over = False
+        self._has_begun = not waits
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name="record", daemon=True)
         self._thread.start()
+
+    def begin(self, first: Any) -> None:
+        """Record something before everything that has been put so far."""
+        self._waiting.appendleft(first)
+        self._has_begun = True
 
     def put(self, item: Any) -> None:
         """Record something that must not be lost."""
@@ -85,7 +93,7 @@ class Sender:
             self._give_up(f"{type(error).__name__}: {error}")
 
     def _send_waiting(self) -> None:
-        while self._waiting and not self._is_over:
+        while self._has_begun and self._waiting and not self._is_over:
             batch = [self._waiting.popleft() for _ in range(min(BATCH, len(self._waiting)))]
             if self._dropped:
                 batch.append(Dropped(self._dropped))
@@ -98,7 +106,7 @@ class Sender:
         self._is_over = True
         self._waiting.clear()
         log.error("the recording ends here: %s", why)
-        self._report("recording-failed", {"why": why})
+        self._report(FAILED, {"why": why})
 
 
 class _Pickler(pickle.Pickler):

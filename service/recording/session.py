@@ -20,7 +20,7 @@ from hal.host_process import HostProcess
 from service.jsonable import jsonable
 from service.knowledge.calibrations import Calibrations
 from service.recording.endpoint import Endpoint
-from service.recording.sender import Note, Sender
+from service.recording.sender import FAILED, Note, Sender
 from service.recording.writer import Contents, make_recorder
 
 CELL, PANEL, CALIBRATIONS, KNOWLEDGE = "cell.toml", "panel.toml", "calibrations", "knowledge"
@@ -50,12 +50,17 @@ class Stepping(Protocol):
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class RecordingSession:
-    """A recording that runs; closing it ends the file."""
+    """A recording that runs; closing it ends the file.
+
+    Attributes:
+        problem: why the recording has ended early; empty while it goes on.
+    """
 
     path: Path
     endpoint: Endpoint
     _process: HostProcess
     _sender: Sender
+    problem: str = ""
     _steps: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -94,6 +99,8 @@ class RecordingSession:
 
     def note(self, kind: str, data: dict[str, Any]) -> None:
         """Record an event, without waiting."""
+        if kind == FAILED:
+            self.problem = str(data["why"])
         self._sender.put(Note(kind=kind, data=jsonable(data), wall_s=time.monotonic()))
 
     def on_task(self, task: Stepping) -> None:

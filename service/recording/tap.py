@@ -111,7 +111,7 @@ class Tap:
             wall_s=time.monotonic(),
             epoch_ns=time.time_ns(),
         )
-        self.sender.put(started)
+        self.sender.begin(started)
         return {name: self._object(name, target) for name, target in objects.items()}
 
     def for_control(self, devices: Mapping[str, Any]) -> dict[str, Any]:

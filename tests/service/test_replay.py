@@ -99,6 +99,13 @@ def test_a_motion_that_differs_in_its_last_bits_still_sees_the_same_and_is_told(
     assert "motion 'turn' differs from the recorded one" in verdict.differences[0]
 
 
+def test_a_recording_of_real_devices_is_replayed_without_a_reset_because_nothing_moves(
+    recorded: RecordSession, replayed: Callable[..., list[Verdict]]
+) -> None:
+    (verdict,) = replayed(recorded(tasks=TWO[:1], mode="mixed"))
+    assert verdict.same_bits, verdict.differences
+
+
 def test_fewer_questions_are_told_too(looked: Path, replayed: Callable[..., list[Verdict]]) -> None:
     (verdict,) = replayed(looked, changed(lambda request: request.model_copy(update={"looks": 1})))
     assert (verdict.answered, verdict.calls) == (8, 13)

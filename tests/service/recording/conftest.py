@@ -52,6 +52,7 @@ def recorded(write_cell: WriteCell, tmp_path: Path) -> RecordSession:
         path = tmp_path / "session.mcap"
         cell = load_cell(write_cell(robot=True, **given))
         with running(Service(cell, OPERATIONS, runs_dir=tmp_path / "runs", inline=inline, record=path)) as service:
+            service.supervisor.reset("a person", seen_count=service.supervisor.latch.state().count)
             for verb, request in tasks:
                 run(service, verb, **request)
         return path

@@ -110,7 +110,7 @@ def test_what_was_flushed_survives_the_death_of_the_recorder(write_cell: WriteCe
     cell = load_cell(write_cell(robot=True))
     with running(Service(cell, OPERATIONS, runs_dir=tmp_path / "runs", inline=True, record=path)) as service:
         run(service, "look")
-        process = service._recording._process  # type: ignore[union-attr]
+        process = service.recording._process  # type: ignore[union-attr]
         process.proxy("recorder").flush()
         os.kill(process.pid or 0, signal.SIGKILL)
         process.await_end()
@@ -163,3 +163,21 @@ def test_a_slow_recorder_costs_readings_which_are_counted_and_nothing_else() -> 
     assert lost + sum(isinstance(item, tuple) for item in items) == MOST_ROWS + 200
     assert 0 < lost <= 200
     assert "a call" in items
+
+
+def test_what_the_control_loop_does_before_the_cell_is_described_follows_the_description() -> None:
+    """In a cell on the wall's clock the control loop reads its devices while the others are still being described."""
+    batches: list[bytes] = []
+
+    def take(batch: bytes) -> str:
+        batches.append(batch)
+        return ""
+
+    sender = Sender(take, report=lambda _kind, _data: None, waits=True)
+    sender.put_row((0, 0.0, 0.0, None, (1,)))
+    sender._send_waiting()  # what its thread does every 20 ms
+    assert batches == []
+    sender.begin("the cell")
+    sender.close()
+    items = [item for batch in batches for item in pickle.loads(batch)]  # noqa: S301
+    assert items == ["the cell", (0, 0.0, 0.0, None, (1,))]

@@ -22,6 +22,7 @@ GRIP_RATIO = 0.55  # how far up the bat the fingertip pushes: high enough for a 
 SIDE_M = 0.008  # free space between fingertip and bat when approaching; more than the pose error
 BEYOND_M = 0.013  # distance of the fingertip's face beyond the middle at the end of a free sweep
 SWEEP_M_PER_S = 0.03
+LEAST_STOP_N = 27.0  # of further tries: a panel file may state the usual effort instead of the measured one
 FIRST_N = 24.0  # of the first try; the fingertip ends it against the bat's stop, some newtons higher
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 MET_N, MET_SHARE = 2.0, 0.1  # across the fingers, in this share of the sweep: less is noise or the hand's inertia
@@ -151,7 +152,7 @@ def stop_force_n(switch: Handle) -> float:
 
     The effort in the panel file acts at the tip of the bat; the fingertip pushes lower down.
     """
-    return EFFORT_SPREAD * switch.force_n / GRIP_RATIO + END_N
+    return max(LEAST_STOP_N, EFFORT_SPREAD * switch.force_n / GRIP_RATIO + END_N)
 
 
 def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float, reach_m: float) -> None:

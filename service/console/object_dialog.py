@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import Any
 
 from nicegui import ui
@@ -171,9 +172,8 @@ class ObjectDialog:
         while task is not None and task["state"] not in FINAL:
             step = task["step"] or say("task.queued")
             self._told.set_content(attribute(say("object.working", label=label, step=step)))
-            task_id = task["id"]
             await asyncio.sleep(POLL_S)
-            task = await attempt(lambda task_id=task_id: client.get(f"/v1/tasks/{task_id}"))  # type: ignore[misc]
+            task = await attempt(partial(client.get, f"/v1/tasks/{task['id']}"))
         if task is None:
             return
         self._mirror.hurry()

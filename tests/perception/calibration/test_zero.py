@@ -71,4 +71,5 @@ def test_the_command_writes_the_sensor_s_record_and_takes_it_off_the_list(tmp_pa
     after = load_calibration(record)
     assert after.mount is not None and after.to_measure == () and after.version == 2
     assert after.mount.position_m == pytest.approx((-0.02, 0.022, Z_M), abs=1e-4)
-    assert after.mount.sigma_m[2] > load_calibration(gripper).mount.sigma_m[2]  # type: ignore[union-attr]
+    grip = load_calibration(gripper).mount
+    assert grip is not None and after.mount.sigma_m[2] > grip.sigma_m[2]

@@ -167,13 +167,13 @@ def test_a_key_file_of_a_client_is_its_users_alone(tmp_path: Path) -> None:
 
 def test_the_commands_add_list_and_revoke_and_the_journal_has_both(tmp_path: Path) -> None:
     runner, runs, app = CliRunner(), ["--runs", str(tmp_path)], _app()
-    done = runner.invoke(app, ["keys", "add", "alice", "--role", "operator", "--valid-for", "90d", *runs])  # type: ignore[arg-type]
+    done = runner.invoke(app, ["keys", "add", "alice", "--role", "operator", "--valid-for", "90d", *runs])
     assert done.exit_code == 0, done.output
     secret = done.stdout.strip()
     assert KeyBook(tmp_path / ".service/keys.json").find(secret) is not None
-    shown = runner.invoke(app, ["keys", "list", *runs]).stdout  # type: ignore[arg-type]
+    shown = runner.invoke(app, ["keys", "list", *runs]).stdout
     assert "alice" in shown and "operator" in shown and "active" in shown and secret not in shown
-    assert runner.invoke(app, ["keys", "revoke", "alice", *runs]).exit_code == 0  # type: ignore[arg-type]
+    assert runner.invoke(app, ["keys", "revoke", "alice", *runs]).exit_code == 0
     kinds = [record.kind for record in read_records(tmp_path / ".service/journal.sqlite")]
     assert kinds == ["key-added", "key-revoked"]
     assert KeyBook(tmp_path / ".service/keys.json").find(secret) is None

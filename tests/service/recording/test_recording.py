@@ -110,7 +110,7 @@ def test_what_was_flushed_survives_the_death_of_the_recorder(write_cell: WriteCe
     cell = load_cell(write_cell(robot=True))
     with running(Service(cell, OPERATIONS, runs_dir=tmp_path / "runs", inline=True, record=path)) as service:
         run(service, "look")
-        process = service.recording._process  # type: ignore[union-attr]
+        process = service.recording._process  # type: ignore[union-attr]  # it records
         process.proxy("recorder").flush()
         os.kill(process.pid or 0, signal.SIGKILL)
         process.await_end()
@@ -158,7 +158,7 @@ def test_a_slow_recorder_costs_readings_which_are_counted_and_nothing_else() -> 
     sender.put("a call")
     is_open.set()
     sender.close()
-    items = [item for batch in batches for item in pickle.loads(batch)]  # noqa: S301
+    items = [item for batch in batches for item in pickle.loads(batch)]  # noqa: S301 - our own rows
     lost = sum(item.rows for item in items if isinstance(item, Dropped))
     assert lost + sum(isinstance(item, tuple) for item in items) == MOST_ROWS + 200
     assert 0 < lost <= 200
@@ -179,5 +179,5 @@ def test_what_the_control_loop_does_before_the_cell_is_described_follows_the_des
     assert batches == []
     sender.begin("the cell")
     sender.close()
-    items = [item for batch in batches for item in pickle.loads(batch)]  # noqa: S301
+    items = [item for batch in batches for item in pickle.loads(batch)]  # noqa: S301 - our own rows
     assert items == ["the cell", (0, 0.0, 0.0, None, (1,))]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import ctypes.util
+import os
+import socket
 import threading
 from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
-from drivers.gige.aravis import library
+from drivers.gige.aravis import AravisCamera, library
 from drivers.gige.camera import GigeCamera
 from drivers.gige.frames import Frame
 from drivers.gige.settings import GigeCameraOptions
@@ -84,6 +87,23 @@ def test_numbers_are_whole_and_stamps_even(far_side: FakeGigeCamera) -> None:
     errors_s = np.array([s.host_time_s - s.device_time_s for s in samples])
     assert np.ptp(errors_s[10:]) < 0.05
     device.close()
+
+
+def test_the_receive_buffer_is_enlarged_before_the_first_frame(
+    far_side: FakeGigeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    do, sizes = AravisCamera.do, set[int]()
+
+    def noted(camera: AravisCamera, function: str, *arguments: Any) -> Any:
+        if function == "start_acquisition":
+            for opened in psutil.Process().net_connections("udp"):
+                with socket.socket(fileno=os.dup(opened.fd)) as copy:
+                    sizes.add(copy.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
+        return do(camera, function, *arguments)
+
+    monkeypatch.setattr(AravisCamera, "do", noted)
+    gige(socket_buffer_bytes=70_000).close()
+    assert 140_000 in sizes, "Linux doubles the size for its own needs"
 
 
 @pytest.mark.third_party("aravis-tools", "gige:camera")

@@ -15,6 +15,7 @@ import time
 from contextlib import suppress
 from ctypes import POINTER, byref, c_bool, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint32, c_uint64, c_void_p
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -276,11 +277,11 @@ def _enlarge_receive_buffer(port: int, size_bytes: int) -> None:
     of 208 KiB, which one frame of 512x512 pixels overfills: about one first frame in four was incomplete on a busy machine.
     """
     with suppress(FileNotFoundError):
-        for name in os.listdir("/proc/self/fd"):
-            with suppress(OSError):  # closed since it was listed, or no socket
-                if not os.readlink(f"/proc/self/fd/{name}").startswith("socket:"):
+        for opened in Path("/proc/self/fd").iterdir():
+            with suppress(OSError):  # closed since it was listed
+                if not opened.readlink().name.startswith("socket:"):
                     continue
-                with socket.socket(fileno=os.dup(int(name))) as copy:
+                with socket.socket(fileno=os.dup(int(opened.name))) as copy:
                     if copy.type == socket.SOCK_DGRAM and copy.getsockname()[1] == port:
                         copy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size_bytes)
 

@@ -88,7 +88,7 @@ def _local_cluster(distributed: Any, workers: int) -> Any:
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",  # None would take port 8787, and warn where it is taken
             host="127.0.0.1",
             silence_logs=logging.ERROR,
         )

@@ -88,11 +88,11 @@ class PtyPort:
             time.sleep(max(0.0, timeout_s))
             return []
         master = self._fds[0]
-        if not select.select([master], [], [], max(0.0, timeout_s))[0]:
-            return []
         try:
+            if not select.select([master], [], [], max(0.0, timeout_s))[0]:
+                return []
             data = os.read(master, 65_536)
-        except OSError:
+        except OSError:  # the port may vanish while this waits
             return []
         return [(None, data)] if data else []
 

@@ -131,7 +131,7 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path):
     seen: list[tuple[int, int]] = []
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
@@ -148,7 +148,7 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path):
 def test_a_scheduler_without_workers_is_refused_in_time(folder, monkeypatch):
     monkeypatch.setattr("hal.workers.LOOK_S", 0.2)
     with (
-        distributed.LocalCluster(n_workers=0, dashboard_address=None, host="127.0.0.1") as cluster,
+        distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", host="127.0.0.1") as cluster,
         pytest.raises(ConfigError, match="no workers"),
     ):
         batch_range(folder, scheduler=cluster.scheduler_address)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+import typer.main
 
 from hal.config import load_cell
 from hal.panel import PanelObject, load_panel
@@ -50,12 +52,42 @@ def test_the_page_of_the_panel_file_has_every_key_of_the_products_kinds(point: E
     assert sorted(named) == sorted(own)
 
 
-def test_every_command_that_the_pages_name_exists() -> None:
-    known = CliRunner().invoke(_app(), ["--help"]).output
-    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-    commands = set(re.findall(r"(?:`|bin/|^)panelwright ([a-z][a-z-]+)", text, flags=re.MULTILINE))
-    assert {"serve", "demo", "doctor"} <= commands
-    assert not {command for command in commands if f" {command} " not in known}
+def _written_commands() -> set[str]:
+    """Return the command lines of all pages, and those that messages and docstrings of the sources name in backticks."""
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    lines = re.findall(r"^(?:\.venv/bin/)?panelwright ([a-z][^\n#>|&]*)", pages, flags=re.MULTILINE)
+    texts = [pages]
+    for room in ("drivers", "hal", "manipulation", "perception", "service", "simbackend"):
+        for path in (ROOT / room).rglob("*.py"):
+            source = path.read_text(encoding="utf-8")
+            for node in ast.walk(ast.parse(source)) if "`panelwright " in source else ():
+                if isinstance(node, ast.JoinedStr):
+                    texts.append("".join(str(v.value) if isinstance(v, ast.Constant) else " " for v in node.values))
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    texts.append(node.value)
+    quoted = (found for text in texts for found in re.findall(r"`(?:\.venv/bin/)?panelwright ([a-z][^`]*)`", text))
+    return {" ".join(line.split()) for line in [*lines, *quoted]}
+
+
+def _unknown(command: Any, words: list[str]) -> str | None:
+    """Return the first command or option of a command line that does not exist; `…` stands for any."""
+    known = set[str]()
+    while True:
+        known |= {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        if not hasattr(command, "commands") or not words or words[0].startswith(("-", "…")):
+            break
+        if words[0] not in command.commands:
+            return words[0]
+        command = command.commands[words.pop(0)]
+    options = (word.partition("=")[0].rstrip(",;:") for word in words if word.startswith("--"))
+    return next((option for option in options if option not in {*known, "--help", "--"}), None)
+
+
+def test_every_command_that_pages_and_messages_name_exists_with_its_options() -> None:
+    commands, panelwright = _written_commands(), typer.main.get_command(_app())
+    assert {"serve", "demo", "doctor"} <= {line.split()[0] for line in commands}
+    unknown = {line: _unknown(panelwright, line.split()) for line in commands}
+    assert not {line: word for line, word in unknown.items() if word is not None}
 
 
 def test_the_page_of_commands_is_what_the_commands_say() -> None:

@@ -11,6 +11,7 @@ from hal.errors import NotFound
 from perception.range.sensor import RangeSensorModel
 
 SAME_SURFACE_M = 0.004  # points so near the nearest one in a pixel are averaged, because the nearest alone is biased
+NEIGHBOUR_PX = 2  # a slope is taken over at most so many pixels to each side
 FILL_NEIGHBOURS = 3  # an empty pixel with so many measured neighbours on one surface is filled
 FILL_PASSES = 2
 NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (1, 1), (1, 0), (1, -1), (0, 1))  # the last four opposite the first
@@ -60,19 +61,37 @@ def _means(index: NDArray[np.int64], depth_m: Array, value: Array, offset_px: Ar
 
 
 def _at_centres(means: Array) -> Array:
-    """Return the values (H, W) at the pixels' centres, using the slope between the neighbours on both sides."""
+    """Return the values (H, W) at the pixels' centres, using the slope between the neighbours on both sides.
+
+    A sweep leaves whole rows empty. Without a slope the rows beside them would be off by the slope of half a pixel.
+    """
     value, *offsets = means
     out = value.copy()
     for axis, offset in enumerate(offsets):
-        before, after = (np.roll(np.stack([value, offset]), turn, axis=axis + 1) for turn in (1, -1))
-        # The neighbours' values belong to their own mean positions, whose distance is 2 px plus the difference of offsets.
-        slope = (after[0] - before[0]) / (2.0 + after[1] - before[1])
-        is_smooth = np.abs(after[0] + before[0] - 2.0 * value) < np.abs(after[0] - before[0]) + 0.01 * np.abs(value)
+        (before, at_before), (after, at_after) = (_beside(value, offset, axis, side) for side in (-1, 1))
+        slope = (after - before) / (at_after - at_before)
+        is_smooth = np.abs(after + before - 2.0 * value) < np.abs(after - before) + 0.01 * np.abs(value)
         is_smooth &= np.abs(slope) < 0.02 * np.abs(value)  # no jump: at most 1 cm per pixel at half a metre
-        edge = [0, -1]
-        is_smooth[(edge, slice(None)) if axis == 0 else (slice(None), edge)] = False
         out = out - np.where(is_smooth, slope * offset, 0.0)
     return np.asarray(out)
+
+
+def _beside(value: Array, offset_px: Array, axis: int, side: int) -> tuple[Array, Array]:
+    """Return value and place in pixels, (H, W) each, of the nearest measured neighbour before (-1) or after (1).
+
+    The place is relative to the centre of the pixel whose neighbour it is; both are NaN where no neighbour is near.
+    """
+    found = np.full((2, *value.shape), np.nan)
+    for far in range(NEIGHBOUR_PX, 0, -1):
+        inner, outer = slice(far, None), slice(None, -far)
+        to, of = (_along(axis, part) for part in ((inner, outer) if side < 0 else (outer, inner)))
+        seen = np.stack([value[of], offset_px[of] + side * far])
+        found[0][to], found[1][to] = np.where(np.isfinite(seen), seen, [found[0][to], found[1][to]])
+    return found[0], found[1]
+
+
+def _along(axis: int, part: slice) -> tuple[slice, slice]:
+    return (part, slice(None)) if axis == 0 else (slice(None), part)
 
 
 def _filled_once(depth: Array, tolerance_m: float) -> Array:

@@ -153,6 +153,14 @@ POINT_M = np.array([0.0, 0.0, 0.6])
 FINE = replace(LINE, width=128, rate_hz=50.0, first_angle_rad=-0.4, step_angle_rad=0.8 / 127)
 
 
+def test_rows_beside_an_empty_row_are_as_right_as_others() -> None:
+    """A sweep of 120 lines leaves some of 128 rows empty; a slope that is not known there was 0.2 mm of their depth."""
+    exact = nodding_over_a_plane(0, 0.0)
+    image = image_from_sweep([exact], FINE, base_from_view=identity(), half_height_rad=0.45, swept_rad=0.9)
+    off_m = (image.view.points(image.depth_m) - POINT_M) @ NORMAL
+    assert np.nanmax(np.abs(np.nanmean(off_m, axis=1)[2:-2])) < 5e-5
+
+
 @pytest.mark.parametrize("late_s", [None, 0.013, 0.06])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_image_of_a_sweep_gives_the_plane_within_its_covariance_however_late_its_stamps(
@@ -197,7 +205,7 @@ def test_the_errors_of_a_mount_turn_the_swept_plane_as_far_as_its_covariance_say
         tilt2 = turn @ np.linalg.pinv(feature.direction_covariance, rcond=1e-6) @ turn
         squares.append([offset**2, tilt2 / 2.0])
     assert np.all(np.mean(squares, axis=0) < 2.0)
-    assert np.all(np.mean(squares, axis=0) > 0.3)
+    assert np.all(np.mean(squares, axis=0) > 0.4)
 
 
 EXACT = UncertainPose(parent_from_child=identity(), covariance=np.zeros((6, 6)))

@@ -12,7 +12,7 @@ from hal.calibration import CalibrationRecord, Vector3, load_calibration
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from hal.panel import Panel, load_panel
-from hal.plant import HistorySection
+from hal.plant import HistorySection, RoundSection
 from hal.simulated_events import EventSection
 from hal.strict import Strict, load_toml
 
@@ -190,6 +190,7 @@ class CellFile(Strict):
     safety: SafetySection = SafetySection()
     simulation: SimulationSection = SimulationSection()
     history: HistorySection = HistorySection()
+    rounds: Annotated[tuple[RoundSection, ...], Field(max_length=100)] = ()
     emulators: dict[Name, EmulatorSection] = {}
 
     @model_validator(mode="after")
@@ -198,6 +199,9 @@ class CellFile(Strict):
             if name not in self.devices:
                 known = f"devices: {', '.join(self.devices)}"
                 raise ValueError(f"emulators.{name} must have the name of the device that it emulates; {known}")
+        names = [one.name for one in self.rounds]
+        if len(set(names)) < len(names):
+            raise ValueError("two of the rounds have the same name; give each its own")
         if self.emulators and self.cell.mode == "real":
             raise ValueError("emulators need cell.mode = 'mixed' or 'sim'")
         if self.simulation.cables and self.cell.mode == "real":

@@ -1,10 +1,12 @@
-"""Sections of the cell file about what outlives a mission: the history of readings."""
+"""Sections of the cell file about what outlives a mission: the history of readings, and the rounds."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from datetime import UTC, datetime
+from typing import Annotated, Literal
+from zoneinfo import ZoneInfo
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from hal.strict import Strict
 
@@ -23,3 +25,52 @@ class HistorySection(Strict):
             description="readings that leave the database go to Parquet files, which nothing deletes, instead of away"
         ),
     ] = False
+
+
+class RoundSection(Strict):
+    """`[[rounds]]`: a mission that the service runs by itself, at times that a cron expression states."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+    mission: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,60}$", description="name of a mission file")] = "inspect"
+    cron: Annotated[
+        str,
+        Field(
+            max_length=200, description="minute, hour, day of the month, month, day of the week, as in Debian's cron"
+        ),
+    ]
+    zone: Annotated[str, Field(max_length=60, description="IANA time zone of `cron`, such as Europe/Vienna")] = "UTC"
+    window_s: Annotated[
+        float, Field(ge=60, le=604_800, description="a run that could not begin in time may begin this much later")
+    ] = 3600.0
+    missed: Annotated[
+        Literal["late", "skip"],
+        Field(description="after the window: `late` runs the newest missed run as soon as it may, `skip` none"),
+    ] = "skip"
+    forbidden_by: Annotated[
+        tuple[str, ...],
+        Field(max_length=50, description="alarms that keep it from beginning while their condition holds"),
+    ] = ()
+
+    @field_validator("cron")
+    @classmethod
+    def _is_cron(cls, text: str) -> str:
+        from cronsim import CronSim, CronSimError  # only cells with rounds need it
+
+        if len(text.split()) != 5:
+            raise ValueError(f"{text!r} has {len(text.split())} fields instead of 5: minute hour day month weekday")
+        try:
+            next(CronSim(text, datetime.now(UTC)))
+        except StopIteration:
+            raise ValueError(f"{text!r} names no day that ever comes") from None
+        except (CronSimError, ValueError) as error:
+            raise ValueError(f"{text!r} is no cron expression: {error}") from None
+        return text
+
+    @field_validator("zone")
+    @classmethod
+    def _is_zone(cls, name: str) -> str:
+        try:
+            ZoneInfo(name)
+        except (LookupError, ValueError, OSError):
+            raise ValueError(f"{name!r} is no IANA time zone; write for example Europe/Vienna") from None
+        return name

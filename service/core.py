@@ -21,17 +21,16 @@ from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError,
 from service.access.actor import actor
 from service.access.keys import FILE as KEYS_FILE
 from service.access.keys import KeyBook
-from service.alarms.desk import AlarmDesk
 from service.commissioning.places import AllowedPlaces
 from service.commissioning.preflight import check_wires
 from service.errors import NotPossibleNow
-from service.history.observer import Observations
-from service.history.store import History
 from service.knowledge.calibrations import Calibrations
 from service.operations import Operation, OperationContext
+from service.plant import Plant
 from service.processes.device_slots import IN_MOTION
 from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
+from service.rounds.cell import RunningCell
 from service.tasks.earlier_runs import tasks_of_earlier_runs
 from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
@@ -48,8 +47,6 @@ if TYPE_CHECKING:
 
 RECORDINGS = "recordings"  # folder below `runs_dir` of the files that clients may replay
 LOOK_S = 0.05
-ALARMS_S = 1.0
-RESTORED_ALARMS = 1000
 NO_LEASE = Command()
 NOTE_STOP_S = 0.01  # the stop port waits for the record before it answers
 COMMIT_S = 2.0  # an answer waits no longer for a slow disk
@@ -90,9 +87,7 @@ class Service:
         state_dir = runs_dir / ".service"
         self.recording = None if record is None else self._record(record, inline)
         self.journal = Journal(state_dir / "journal.sqlite")
-        self.history = self._open_history(state_dir / "history")
-        self.alarms = self._open_alarms(state_dir / "alarms.json")
-        self.observations = Observations(history=self.history, listeners=[self.alarms.take])
+        self.plant = Plant(cell, state_dir, journal=self.journal, note=self.note, commit=self.commit)
         self.keys = book_of(runs_dir)
         self.supervisor = Supervisor(
             cell,
@@ -116,14 +111,15 @@ class Service:
             report=self.note,
             commit=self.commit,
         )
+        self.plant.keep_rounds(
+            lambda is_active: RunningCell(
+                supervisor=self.supervisor, lease=self.lease, tasks=self.tasks, is_active=is_active, submit=self._round
+            )
+        )
         self._is_closing = threading.Event()
         self._folder_lock = (state_dir / "lock").open("w")  # held until the process ends, even if it is killed
-        if _is_alone(self._folder_lock):
-            for task in tasks_of_earlier_runs(self.journal):
-                self.tasks.restore(task)
-            self.tasks.sweep()
-        else:  # tasks of the other service; those that run were not aborted
-            log.warning("another panelwright writes to %s too: tasks of earlier runs are not shown", runs_dir)
+        self._is_alone = _is_alone(self._folder_lock)
+        self._restore_tasks()
 
     def start(self) -> None:
         """Start the cell and wait until it is ready.
@@ -134,9 +130,21 @@ class Service:
         self.note("service-start", {"cell": self.cell.name, "mode": self.cell.file.cell.mode})
         for watch in (self._watch_stop, self._watch_lease):
             threading.Thread(target=watch, name=watch.__name__, daemon=True).start()
-        threading.Thread(target=self._tend_alarms, name="alarms", daemon=True).start()
         self.journal_watch.start()
+        self.plant.start(keeps_rounds=self._is_alone)
         self.supervisor.start()
+
+    def _restore_tasks(self) -> None:
+        """Take over the tasks of earlier runs; with another service on the folder they are that one's, and were not aborted."""
+        if not self._is_alone:
+            log.warning(
+                "another panelwright writes to %s too: tasks of earlier runs are not shown, and rounds do not begin here",
+                self.runs_dir,
+            )
+            return
+        for task in tasks_of_earlier_runs(self.journal):
+            self.tasks.restore(task)
+        self.tasks.sweep()
 
     def submit(
         self,
@@ -171,7 +179,7 @@ class Service:
         latch = self.supervisor.latch.state()
         if moves and latch.is_latched:
             raise stopped(latch.source)
-        observe = partial(self.observations.of_task, verb=verb, asked_by=actor() or holder or "")
+        observe = partial(self.plant.observations.of_task, verb=verb, asked_by=actor() or holder or "")
         asked = request.model_dump(mode="json")
         sub = self.lease.lend(is_own=is_followed and holder is None) if moves else None
         work = self._work(operation, request, command=command, observe=observe, sub=sub, stops_seen=latch.count)
@@ -230,6 +238,11 @@ class Service:
                 self.tasks.cancel(task.id, reason=error.what)
             raise
 
+    def _round(self, mission: str, key: str) -> Task:
+        """Start the mission of a round."""
+        request = self.operations["missions"].request_model.model_validate({"file": mission})
+        return self.submit("missions", request, key=key)
+
     def swap_device(self, name: str, section: DeviceSection) -> None:
         """Use another driver or other options for a device until the service ends; see `service.processes.device_slots`.
 
@@ -276,7 +289,7 @@ class Service:
         self.journal_watch.close()
         self.supervisor.close()
         self.note("service-end", {})
-        self.history.close()
+        self.plant.close()
         self.journal.close()
         if self.recording is not None:
             self.recording.close()
@@ -325,11 +338,6 @@ class Service:
         while not self._is_closing.wait(NOTE_STOP_S):
             self.supervisor.note_stop()
 
-    def _tend_alarms(self) -> None:
-        """Let the alarms' time pass, in a thread of its own because each change waits for the disk."""
-        while not self._is_closing.wait(ALARMS_S):
-            self.alarms.tick()
-
     def _watch_lease(self) -> None:
         """End the lease at the moment at which its heartbeat is overdue; a thread of its own, so that no record delays it."""
         while not self._is_closing.wait(min(LOOK_S, self.lease.soonest_s())):
@@ -353,24 +361,6 @@ class Service:
         if self.recording is not None:
             self.recording.note(kind, data)
         self.journal.append(kind, data, timeout_s=COMMIT_S)
-
-    def _open_history(self, folder: Path) -> History:
-        """Open the history of readings; a damaged file is set aside, and the journal says so."""
-        cell = self.cell
-        history = History(folder, cell=cell.name, panel=cell.panel.name, bounds=cell.file.history)
-        if history.set_aside_now is not None:
-            self.note("history-set-aside", {"file": str(history.set_aside_now)})
-        return history
-
-    def _open_alarms(self, path: Path) -> AlarmDesk:
-        reader, names = self.history.reader(), [one.name for one in self.cell.panel.objects]
-        return AlarmDesk(
-            self.cell.panel,
-            path=path,
-            commit=self.commit,
-            recorded=[record.data for record in self.journal.records(kinds=("alarm",), limit=RESTORED_ALARMS)],
-            valid_at_s=reader.valid_at_s(self.cell.name, names),
-        )
 
     def _record(self, path: Path, inline: bool) -> RecordingSession:
         from service.recording.session import RecordingSession

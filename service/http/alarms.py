@@ -98,7 +98,7 @@ WHY = {**BY, "reason": "the gauge is being replaced"}
 async def list_alarms(
     state: Shared, all: Annotated[bool, Query(description="also alarms that are normal")] = False
 ) -> AlarmList:
-    desk = state.service.alarms
+    desk = state.service.plant.alarms
     shown = [alarm for alarm in desk.all() if all or alarm.state is not State.NORMAL]
     views = [_view(state, alarm) for alarm in sorted(shown, key=functools.partial(_rank, state))]
     return AlarmList(alarms=views, straddled=[DoubtView(alarm=k, says=told) for k, told in desk.doubts().items()])
@@ -111,7 +111,7 @@ async def list_alarms(
     openapi_extra=body_schema(AcknowledgeRequest, BY, required=True),
 )
 async def acknowledge_alarm(state: Shared, alarm: AlarmId, request: Acknowledge) -> AlarmView:
-    desk = state.service.alarms
+    desk = state.service.plant.alarms
     return await _done(state, functools.partial(desk.acknowledge, alarm, by=request.by, reason=request.reason))
 
 
@@ -123,7 +123,7 @@ async def acknowledge_alarm(state: Shared, alarm: AlarmId, request: Acknowledge)
 )
 async def shelve_alarm(state: Shared, alarm: AlarmId, request: Shelve) -> AlarmView:
     given = request.model_dump()
-    return await _done(state, functools.partial(state.service.alarms.shelve, alarm, **given))
+    return await _done(state, functools.partial(state.service.plant.alarms.shelve, alarm, **given))
 
 
 @router.post(
@@ -133,7 +133,7 @@ async def shelve_alarm(state: Shared, alarm: AlarmId, request: Shelve) -> AlarmV
     openapi_extra=body_schema(AcknowledgeRequest, BY, required=True),
 )
 async def unshelve_alarm(state: Shared, alarm: AlarmId, request: Acknowledge) -> AlarmView:
-    return await _done(state, functools.partial(state.service.alarms.unshelve, alarm, **request.model_dump()))
+    return await _done(state, functools.partial(state.service.plant.alarms.unshelve, alarm, **request.model_dump()))
 
 
 @router.post(
@@ -144,7 +144,7 @@ async def unshelve_alarm(state: Shared, alarm: AlarmId, request: Acknowledge) ->
 )
 async def take_alarm_out_of_service(state: Shared, alarm: AlarmId, request: OutOfService) -> AlarmView:
     given = request.model_dump()
-    return await _done(state, functools.partial(state.service.alarms.take_out_of_service, alarm, **given))
+    return await _done(state, functools.partial(state.service.plant.alarms.take_out_of_service, alarm, **given))
 
 
 @router.post(
@@ -154,7 +154,9 @@ async def take_alarm_out_of_service(state: Shared, alarm: AlarmId, request: OutO
     openapi_extra=body_schema(AcknowledgeRequest, BY, required=True),
 )
 async def put_alarm_in_service(state: Shared, alarm: AlarmId, request: Acknowledge) -> AlarmView:
-    return await _done(state, functools.partial(state.service.alarms.put_in_service, alarm, **request.model_dump()))
+    return await _done(
+        state, functools.partial(state.service.plant.alarms.put_in_service, alarm, **request.model_dump())
+    )
 
 
 async def _done(state: AppState, deed: Callable[[], Alarm]) -> AlarmView:

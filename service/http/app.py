@@ -28,6 +28,7 @@ from service.http import (
     knowledge,
     missions,
     photographs,
+    rounds,
     session,
     stream,
     tasks,
@@ -106,6 +107,7 @@ def create_app(
         missions.router,
         history.router,
         alarms.router,
+        rounds.router,
         session.router,
         health.router,
         stream.router,
@@ -165,6 +167,7 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         OutlineRequest,
         TeachRequest,
         *alarms.BODIES,
+        *rounds.BODIES,
         Problem,
     ]
     _, extra = models_json_schema(

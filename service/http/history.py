@@ -94,7 +94,7 @@ class HistoryOverview(BaseModel):
 
 @router.get("", summary="Newest reading of each object", operation_id="history_overview")
 async def history_overview(state: State) -> HistoryOverview:
-    history, cell = state.service.history, state.service.cell.name
+    history, cell = state.service.plant.history, state.service.cell.name
     rows = await state.in_thread(lambda: history.reader().newest(cell))
     return HistoryOverview(newest=[_view(row) for row in rows], set_aside=[path.name for path in history.set_aside])
 
@@ -116,7 +116,7 @@ async def export_history(
     question = _question(state, object, since_s, until_s)
     if format == "csv":
         headers = {"Content-Disposition": "attachment; filename=history.csv"}
-        lines = state.service.history.reader().all(question)
+        lines = state.service.plant.history.reader().all(question)
         first = await state.in_thread(
             lambda: next(lines, None)
         )  # a file that cannot be read is an error, not half an answer
@@ -143,7 +143,7 @@ async def show_history(
     ] = 0,
 ) -> HistoryPage:
     question = _question(state, object, since_s, until_s)
-    reader = state.service.history.reader()
+    reader = state.service.plant.history.reader()
     if buckets:
         found = await state.in_thread(functools.partial(reader.trend, question, buckets=buckets))
         return HistoryPage(object=object, buckets=[BucketView(**asdict(bucket)) for bucket in found])
@@ -165,7 +165,7 @@ async def show_history(
 async def fetch_crop(
     state: State, object: ObjectName, crop: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
 ) -> FileResponse:
-    path = await state.in_thread(lambda: state.service.history.crops.path(crop))
+    path = await state.in_thread(lambda: state.service.plant.history.crops.path(crop))
     if path is None:
         raise NoSuchTask("there is no such picture, or it is not kept any more", hint=f"GET /v1/history/{object}")
     return FileResponse(path, media_type="image/png")
@@ -174,7 +174,7 @@ async def fetch_crop(
 def _question(state: AppState, name: str | None, since_s: float | None, until_s: float | None) -> Question:
     if since_s is not None and until_s is not None and until_s < since_s:
         raise InvalidRequest("query.until_s: ends before since_s", hint="swap them")
-    return state.service.history.ask(object=name, since_s=since_s, until_s=until_s)
+    return state.service.plant.history.ask(object=name, since_s=since_s, until_s=until_s)
 
 
 def _view(row: Row) -> HistoryReading:
@@ -208,7 +208,7 @@ def _parquet(state: AppState, question: Question) -> FilePath:
     with tempfile.NamedTemporaryFile(suffix=".parquet", delete=False) as file:
         path = FilePath(file.name)
     try:
-        write_parquet(path, HEAD, (_cells(row) for row in state.service.history.reader().all(question)))
+        write_parquet(path, HEAD, (_cells(row) for row in state.service.plant.history.reader().all(question)))
     except BaseException:
         path.unlink(missing_ok=True)
         raise

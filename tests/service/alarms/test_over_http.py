@@ -19,7 +19,7 @@ LAMP = "pump_lamp.state"
 @pytest.fixture(autouse=True)
 def _lamp_is_off(served: Panelwright, client: httpx2.Client) -> Iterator[None]:
     """Begin each test with the alarm unacknowledged, and end it with the alarm normal."""
-    desk = served.service.alarms
+    desk = served.service.plant.alarms
     desk.take([reading(0, None, object="pump_lamp", kind="lamp", state="off", unit="")])
     yield
     desk.take([reading(0, None, object="pump_lamp", kind="lamp", state="on", unit="")])

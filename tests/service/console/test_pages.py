@@ -105,7 +105,7 @@ class Cell:
             "confidence": 0.9,
             "utc_s": time.time(),
         }
-        self.service.service.history.add([reading(0, value, **given)])
+        self.service.service.plant.history.add([reading(0, value, **given)])
 
 
 @pytest.fixture(scope="module")

@@ -31,9 +31,9 @@ CROP = b"\x89PNG of a gauge"
 @pytest.fixture(scope="module")
 def filled(served: Panelwright) -> Iterator[Panelwright]:
     """Yield a service whose history has ten readings of a gauge, two of them refused."""
-    crop = served.service.history.crops.add(CROP)
+    crop = served.service.plant.history.crops.add(CROP)
     readings = [reading(k, None if k in (3, 7) else float(k), crop=crop, asked_by="a, b") for k in range(10)]
-    served.service.history.add(readings)
+    served.service.plant.history.add(readings)
     yield served
 
 
@@ -152,8 +152,8 @@ def test_the_service_comes_up_with_a_damaged_history_and_names_it(write_cell: Wr
     cell = load_cell(write_cell(robot=True))
     options = Options(port=0, runs_dir=tmp_path / "runs", inline=True)
     panelwright = Panelwright(cell, options, operations=OPERATIONS)
-    (aside,) = panelwright.service.history.set_aside
-    panelwright.service.history.add([replace(reading(0), object="pump_lamp")])
+    (aside,) = panelwright.service.plant.history.set_aside
+    panelwright.service.plant.history.add([replace(reading(0), object="pump_lamp")])
     panelwright.service.close()  # which waits for the journal
     records = panelwright.service.journal.records(kinds=("history-set-aside",))
     assert [record.data["file"] for record in records] == [str(aside)]

@@ -37,6 +37,7 @@ PLACE = {
     "{image_id}": "0" * 24,
     "{mission}": "none",
     "{group}": "kinds",
+    "{round}": "none",
 }
 
 
@@ -111,6 +112,8 @@ def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
         "DELETE /v1/session",
         "POST /v1/knowledge/outline",  # writes nothing
         "POST /v1/read-photograph",
+        "PUT /v1/rounds/{round}",  # about later: a round waits while somebody holds the lease
+        "DELETE /v1/rounds/{round}",
         *(f"POST /v1/alarms/{{alarm}}/{deed}" for deed in ALARM_DEEDS),  # for those who watch, whoever moves the arm
     }
 

@@ -1,0 +1,113 @@
+"""What a service keeps and watches beyond its tasks: the history, the alarms and the rounds of one cell."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from hal.config import Cell
+from hal.errors import CellError, ConfigError
+from hal.plant import RoundSection
+from service.alarms.desk import AlarmDesk
+from service.history.observer import Observations
+from service.history.store import History
+from service.missions.files import checked_file
+from service.rounds.book import RoundBook
+from service.rounds.cell import RunningCell
+from service.rounds.keeper import RoundKeeper
+from service.tasks.journal import Journal
+
+TICK_S = 1.0
+RESTORED_ALARMS = 1000
+
+Record = Callable[[str, dict[str, Any]], None]
+
+
+class Plant:
+    """The history, the alarms and the rounds.
+
+    Args:
+        state_dir: folder of their files.
+        note, commit: write to the journal, without and with waiting for the disk.
+
+    Raises:
+        ConfigError: a round names a mission or an alarm that the cell does not have.
+        HistoryError: a file is of a newer version, or cannot be used.
+    """
+
+    def __init__(self, cell: Cell, state_dir: Path, *, journal: Journal, note: Record, commit: Record) -> None:
+        self._cell = cell
+        self.history = self._open_history(state_dir / "history", note)
+        self.alarms = self._open_alarms(state_dir / "alarms.json", journal, commit)
+        self.observations = Observations(history=self.history, listeners=[self.alarms.take])
+        self._is_closing = threading.Event()
+        self.check_rounds(cell.file.rounds, source=str(cell.path))
+        self._book = RoundBook(state_dir / "rounds" / f"{cell.name}.sqlite")
+
+    def keep_rounds(self, running: Callable[[Callable[[str], bool]], RunningCell]) -> None:
+        """Prepare the rounds.
+
+        Args:
+            running: returns what begins and forbids rounds, given what says whether an alarm's condition holds.
+        """
+        self.rounds = RoundKeeper(self._cell.file.rounds, book=self._book, cell=running(self._is_active))
+
+    def start(self, *, keeps_rounds: bool) -> None:
+        """Let the time of the alarms pass and begin rounds, each in a thread of its own, because both wait for the disk."""
+        ticks = [self.alarms.tick, *([self.rounds.tick] if keeps_rounds else [])]
+        for tick in ticks:
+            threading.Thread(target=self._repeat, args=(tick,), name="plant", daemon=True).start()
+
+    def close(self) -> None:
+        """End the threads and close the files."""
+        self._is_closing.set()
+        self.history.close()
+        self._book.close()
+
+    def check_rounds(self, sections: Sequence[RoundSection], *, source: str) -> None:
+        """Check rounds against the cell: their missions, as `check_mission`, and the alarms that forbid them.
+
+        Raises:
+            ConfigError: names every fault.
+        """
+        known, faults = [alarm.id for alarm in self.alarms.all()], list[str]()
+        for k, one in enumerate(sections):
+            faults += [
+                f"rounds.{k}.forbidden_by: there is no alarm {alarm!r}; alarms: {', '.join(known) or 'none'}"
+                for alarm in one.forbidden_by
+                if alarm not in known
+            ]
+            try:
+                checked_file(one.mission, self._cell)
+            except CellError as error:
+                faults.append(f"rounds.{k}.mission: {error.what}; {error.hint}")
+        if faults:
+            more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+            raise ConfigError(f"{source}: {faults[0]}{more}", hint="correct the rounds", faults=faults)
+
+    def _is_active(self, alarm: str) -> bool:
+        return self.alarms.get(alarm).is_active
+
+    def _repeat(self, tick: Callable[[], None]) -> None:
+        while not self._is_closing.wait(TICK_S):
+            tick()
+
+    def _open_history(self, folder: Path, note: Record) -> History:
+        """Open the history of readings; a damaged file is set aside, and the journal says so."""
+        cell = self._cell
+        history = History(folder, cell=cell.name, panel=cell.panel.name, bounds=cell.file.history)
+        if history.set_aside_now is not None:
+            note("history-set-aside", {"file": str(history.set_aside_now)})
+        return history
+
+    def _open_alarms(self, path: Path, journal: Journal, commit: Record) -> AlarmDesk:
+        reader, names = self.history.reader(), [one.name for one in self._cell.panel.objects]
+        return AlarmDesk(
+            self._cell.panel,
+            path=path,
+            commit=commit,
+            recorded=[record.data for record in journal.records(kinds=("alarm",), limit=RESTORED_ALARMS)],
+            valid_at_s=reader.valid_at_s(self._cell.name, names),
+        )

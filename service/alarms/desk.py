@@ -14,6 +14,7 @@ from typing import Any
 from hal.atomic_write import write_atomically
 from hal.errors import CellError, InvalidRequest
 from hal.panel import Panel
+from service.access.actor import actor
 from service.alarms.conditions import Verdict, Watch
 from service.alarms.lifecycle import Alarm, State
 from service.errors import NoSuchTask
@@ -176,7 +177,8 @@ class AlarmDesk:
 
     def _change(self, before: Alarm, after: Alarm, *, by: str, reason: str) -> Alarm:
         """Record a change, then make it."""
-        after = replace(after, changed_s=self._now_s(), by=by, reason=reason)
+        key_name = None if by == THE_CELL else actor()
+        after = replace(after, changed_s=self._now_s(), by=by, key_name=key_name, reason=reason)
         told = {**asdict(after), "before": str(before.state), "number": self._number + 1}
         self._commit(KIND, {key: value for key, value in told.items() if value is not None})
         self._number += 1

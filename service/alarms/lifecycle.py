@@ -49,6 +49,7 @@ class Alarm:
         says: the condition as a sentence; empty if it never held.
         straddles: whether the interval of the value reaches over the limit, so that the condition is not certain.
         changed_s, by, reason: when, by whom and why its state changed last; `by` is `the cell` for a reading or a time.
+        key_name: the key that authorised that change; None for the cell, and while the service has no keys.
         raised_s: when its condition began to hold last; None if it never did.
         shelved_until_s: seconds since 1970; None unless it is shelved.
     """
@@ -61,6 +62,7 @@ class Alarm:
     straddles: bool = False
     changed_s: float = 0.0
     by: str = ""
+    key_name: str | None = None
     reason: str = ""
     raised_s: float | None = None
     shelved_until_s: float | None = None

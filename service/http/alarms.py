@@ -46,6 +46,9 @@ class AlarmView(BaseModel):
     raised_s: Annotated[float | None, Field(description="seconds since 1970")]
     changed_s: float
     by: str
+    key_name: Annotated[
+        str | None, Field(description="the key that authorised that; null without keys, and for the cell")
+    ]
     reason: str
     shelved_until_s: float | None
 

@@ -25,6 +25,7 @@ from service.http.permissions import TABLE, Asks, row_of
 from service.operations import OPERATIONS
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
+from tests.service.history.test_store import reading
 
 ROLES = (None, *Role)
 ALARM_DEEDS = ("acknowledge", "shelve", "unshelve", "out-of-service", "in-service")
@@ -241,6 +242,17 @@ def test_a_browser_logs_in_for_a_cookie_that_only_its_own_page_may_use(http: htt
     assert http.put("/v1/devices/arm", json={"driver": "fake:arm"}, headers=own).status_code == 403
     assert http.delete("/v1/session", headers=own).status_code == 200
     assert http.get("/v1/tasks", headers=cookie).status_code == 401
+
+
+def test_a_change_of_an_alarm_names_the_key_whatever_the_request_says(http: httpx2.Client, guarded: Guarded) -> None:
+    alarm, headers = "pump_lamp.state", guarded.headers(Role.OPERATOR)
+    guarded.server.service.plant.alarms.take([reading(0, None, object="pump_lamp", kind="lamp", state="off", unit="")])
+    answer = http.post(f"/v1/alarms/{alarm}/acknowledge", json={"by": "somebody else"}, headers=headers)
+    assert (answer.json()["by"], answer.json()["key_name"]) == ("somebody else", "the-operator")
+    assert guarded.rows("alarm")[-1]["key_name"] == "the-operator"
+    guarded.server.service.plant.alarms.take([reading(1, None, object="pump_lamp", kind="lamp", state="on", unit="")])
+    (shown,) = (a for a in http.get("/v1/alarms?all=true", headers=headers).json()["alarms"] if a["id"] == alarm)
+    assert (shown["by"], shown["key_name"]) == ("the cell", None)
 
 
 @pytest.mark.parametrize("site", [None, "same-origin", "none", "same-site", "cross-site"])

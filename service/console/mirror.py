@@ -16,14 +16,16 @@ TICK_S = 0.25
 IDLE_S = 15.0  # nobody has looked for so long: ask less
 PERIODS_S = {
     "ready": 1.0, "tasks": 0.5, "history": 1.0, "alarms": 1.0, "devices": 2.0, "frames": 1.0, "lease": 2.0,
-    "stop": 1.0, "missions": 5.0, "calibrations": 10.0, "info": 10.0, "panel": 10.0, "arm": 0.25, "arm_model": 30.0,
+    "stop": 1.0, "missions": 5.0, "mission_files": 10.0,
+    "calibrations": 10.0, "info": 10.0, "panel": 10.0, "arm": 0.25, "arm_model": 30.0,
 }  # fmt: skip
 PATHS = {
     "ready": "/readyz", "tasks": "/v1/tasks?limit=30", "history": "/v1/history", "alarms": "/v1/alarms",
     "devices": "/v1/devices", "frames": "/v1/frames", "lease": "/v1/lease", "stop": "/v1/stop", "missions": "/v1/missions",
+    "mission_files": "/v1/mission-files",
     "calibrations": "/v1/calibrations", "info": "/v1/info", "panel": "/v1/panel",
 }  # fmt: skip
-ON_DEMAND = ("arm", "arm_model")
+ON_DEMAND = ("arm", "arm_model", "mission_files")
 
 
 class Mirror:
@@ -133,7 +135,7 @@ class Mirror:
             self._follow_active()
 
     def _path(self, topic: str) -> str:
-        if topic not in ON_DEMAND:
+        if topic in PATHS:
             return PATHS[topic]
         devices = self._said.get("devices", {"devices": []})["devices"]
         arm = next((one["name"] for one in devices if one["kind"] == "arm"), "arm")

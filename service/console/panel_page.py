@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.panel import PanelObject
 from service.console.mirror import Mirror
+from service.console.mission_words import is_plan
 from service.console.object_dialog import ObjectDialog
 from service.console.page_frame import Place, clock, live, page_frame, picks, table
 from service.console.panel_drawing import overlay_svg, panel_svg
@@ -77,7 +78,7 @@ def _row(one: PanelObject, reading: Reading | None, alarm: dict[str, Any] | None
 def last_mission(mirror: Mirror) -> str:
     """Return when the last mission ran and how it ended, with its report."""
     heading = f"<h2>{say('last.heading')}</h2>"
-    task = next((one for one in mirror.tasks if one["verb"] == "missions"), None)
+    task = next((one for one in mirror.tasks if one["verb"] == "missions" and not is_plan(one)), None)
     if task is None:
         return heading + f'<p class="quiet">{say("last.none")}</p>'
     line = say("last.ended", started=clock(task["created_s"]), verdict=word("state", task["state"]))

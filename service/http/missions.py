@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import json
 import re
 from pathlib import Path as FilePath
 from typing import Annotated
@@ -15,6 +13,7 @@ from service.errors import NoSuchMission
 from service.http.models import MissionList, MissionView
 from service.http.problems import RESPONSES
 from service.http.state import State
+from service.missions.earlier import Told, told_of
 
 router = APIRouter(prefix="/v1/missions", tags=["missions"], responses=RESPONSES)
 PLAIN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
@@ -51,30 +50,21 @@ def _missions(runs_dir: FilePath) -> list[MissionView]:
     if not runs_dir.is_dir():
         return []
     folders = [path for path in runs_dir.iterdir() if path.is_dir() and PLAIN.fullmatch(path.name)]
-    done = [(_begun(path), path) for path in folders if (path / "report.json").is_file()]
-    return [_mission(path, begun) for begun, path in sorted(done, reverse=True)[:MAX_MISSIONS]]
+    done = [(told_of(path), path) for path in folders if (path / "report.json").is_file()]
+    newest = sorted(done, key=lambda pair: (pair[0].started, pair[1]), reverse=True)[:MAX_MISSIONS]
+    return [_mission(path, told) for told, path in newest]
 
 
-def _begun(folder: FilePath) -> str:
-    """Return when the mission began, from its report, because the file's time changes with an evaluation or a copy."""
-    report = folder / "report.json"
-    return _started(report, report.stat().st_mtime_ns)
-
-
-@functools.lru_cache(maxsize=10_000)
-def _started(report: FilePath, _changed_ns: int) -> str:
-    try:
-        return str(json.loads(report.read_text(encoding="utf-8"))["started"])
-    except (OSError, ValueError, LookupError, TypeError):
-        return ""  # a foreign or damaged report sorts as the oldest
-
-
-def _mission(path: FilePath, begun: str) -> MissionView:
+def _mission(path: FilePath, told: Told) -> MissionView:
     files = sorted(item.name for item in path.iterdir() if item.is_file() and PLAIN.fullmatch(item.name))
     base = f"/v1/missions/{path.name}"
     return MissionView(
         name=path.name,
-        started=begun or None,
+        started=told.started or None,
+        title=told.title,
+        succeeded=told.succeeded,
+        objects=list(told.objects),
+        unfinished_step=told.unfinished_step,
         report_url=f"{base}/report.html" if "report.html" in files else None,
         json_url=f"{base}/report.json" if "report.json" in files else None,
         files=files,

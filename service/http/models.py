@@ -253,10 +253,17 @@ class ResetRequest(Strict):
 
 
 class MissionView(BaseModel):
-    """The files of a finished mission. `started` is when it began (UTC, ISO 8601), from its report."""
+    """The files of a finished mission. `started` is when it began (UTC, ISO 8601), from its report.
+
+    `objects` are those that it read or operated. `unfinished_step` is where `resume` takes it up; null if nothing is left.
+    """
 
     name: str
     started: str | None
+    title: str = ""
+    succeeded: bool | None = None
+    objects: list[str] = []
+    unfinished_step: str | None = None
     report_url: str | None
     json_url: str | None
     files: list[str]

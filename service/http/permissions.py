@@ -62,6 +62,7 @@ TABLE: dict[str, Row] = {
     "GET /v1/devices/{name}/reading": OBSERVER,
     "GET /v1/frames": OBSERVER,
     "GET /v1/panel": OBSERVER,
+    "GET /v1/mission-files": OBSERVER,
     "GET /v1/missions": OBSERVER,
     "GET /v1/missions/{mission}/{name}": OBSERVER,
     "GET /v1/history": OBSERVER,

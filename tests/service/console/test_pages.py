@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Error
+from pydantic import BaseModel
 
 from hal.config import load_cell
 from hal.strict import Strict
@@ -18,7 +21,7 @@ from service.serve import Options, Panelwright
 from tests.service.browser import NEEDS_CHROMIUM, browser
 from tests.service.conftest import WriteCell
 from tests.service.history.test_store import reading
-from tests.service.verbs import OPERATIONS, EchoResult, HoldRequest, HoldResult, hold
+from tests.service.verbs import OPERATIONS, EchoResult, HoldRequest, hold
 from tests.service.waiting import eventually
 
 __all__ = ["browser"]  # a fixture
@@ -59,6 +62,31 @@ class SetRequest(Strict):
     value: float = 7.0
 
 
+class MissionAsked(Strict):
+    """What the console asks for on the page of missions."""
+
+    file: str | None = None
+    resume: str | None = None
+    dry_run: bool = False
+
+
+class MissionTold(BaseModel):
+    """What a mission of this test tells."""
+
+    plan: dict[str, Any] | None = None
+
+
+def mission(context: OperationContext, request: MissionAsked) -> MissionTold:
+    """Plan one station, or stand still until it is cancelled."""
+    if request.dry_run:
+        station = {"step": "read", "what": "close-up of setpoint", "way_s": 1.5, "problem": None}
+        times = {"ways_s": 1.5, "contact_s": 0.0, "expected_s": 1.5}
+        return MissionTold(plan={"stations": [station], "is_possible": True, "located": True, **times})
+    context.task.progress(0.1, "close-up", "setpoint")
+    hold(context, HoldRequest())
+    return MissionTold()
+
+
 class Cell:
     """A service of fakes with its console. A slider that is set or read is in the history afterwards."""
 
@@ -67,7 +95,13 @@ class Cell:
         (path.parent / "panel.toml").write_text((path.parent / "panel.toml").read_text() + SLIDER)
         self.asked: list[SetRequest] = []
         holds = Operation(
-            name="missions", request_model=HoldRequest, result_model=HoldResult, run=hold, summary="Hold", moves=True
+            name="missions",
+            request_model=MissionAsked,
+            result_model=MissionTold,
+            run=mission,
+            summary="Hold",
+            moves=True,
+            is_still=lambda request: request.dry_run,
         )
         sets = {
             verb: Operation(
@@ -154,10 +188,36 @@ def test_an_object_is_opened_read_and_set_only_after_a_yes(page: Any, cell: Cell
     page.wait_for_selector(".dialog", state="hidden")
 
 
+def test_a_mission_is_chosen_planned_and_taken_up_where_it_ended(page: Any, cell: Cell) -> None:
+    leave_mission(cell.service.service.runs_dir / "20260103T000000-a", done=["read"])
+    page.goto(f"{cell.url}/missions")
+    page.click("[data-mission=demo]")
+    until(page, "document.querySelector('.main').textContent.includes('Touches the plate 4 times')")
+    page.click("button:text-is('Dry run'):not([disabled])")
+    until(page, "document.querySelector('.main').textContent.includes('Every place can be reached')")
+    until(page, "document.querySelector('.main').textContent.includes('Reads from close up: SETPOINT')")
+    assert cell.service.service.tasks.all()[0].request["file"] == "demo"
+    page.click("button:text-is('Take up at “feel”')")
+    until(page, "document.querySelector('.steps').textContent.includes('Reads from close up: SETPOINT')")
+    assert cell.service.service.tasks.all()[0].request["resume"] == "20260103T000000-a"
+    page.click("button:text-is('Cancel'):not([disabled])")
+    until(page, "document.querySelector('.steps').textContent.includes('cancelled')")
+
+
+def leave_mission(folder: Path, *, done: list[str]) -> None:
+    """Write what an earlier mission leaves: a report, and how far it got."""
+    folder.mkdir()
+    told = {"started": "2026-01-03T00:00:00Z", "succeeded": False, "readings": [{"name": "setpoint"}], "actions": []}
+    (folder / "report.json").write_text(json.dumps(told))
+    (folder / "report.html").write_text("<h1>report</h1>")
+    steps = [{"name": "read"}, {"name": "feel"}]
+    (folder / "progress.json").write_text(json.dumps({"mission": {"title": "Look", "steps": steps}, "done": done}))
+
+
 def test_a_mission_goes_on_while_the_console_is_killed_and_comes_back(page: Any, cell: Cell) -> None:
     page.goto(f"{cell.url}/missions")
     page.click("button:text-is('Run mission'):not([disabled])")
-    until(page, "document.querySelector('.steps').textContent.includes('holding')")
+    until(page, "document.querySelector('.steps').textContent.includes('Holding')")
     first = cell.console.pid
     page.evaluate("document.body.dataset.served = 'by the console that is killed'")
     os.kill(first, signal.SIGKILL)
@@ -166,7 +226,7 @@ def test_a_mission_goes_on_while_the_console_is_killed_and_comes_back(page: Any,
     until(
         page,
         "document.body.dataset.served === undefined && document.querySelector('.bar') !== null"
-        " && document.querySelector('.steps').textContent.includes('holding')",
+        " && document.querySelector('.steps').textContent.includes('Holding')",
     )
     assert task.state == "running"
     page.click("button:text-is('Cancel'):not([disabled])")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import math
 import re
 from dataclasses import asdict
@@ -20,6 +21,8 @@ from hal.panel import NumberGoal, Panel, load_panel
 from manipulation import Kinematics
 from service.console.cell_page import joint_frames
 from service.console.mirror import Mirror
+from service.console.mission_words import did, step_list
+from service.console.missions_page import plan_table
 from service.console.object_dialog import history_html
 from service.console.own_page import is_own
 from service.console.panel_drawing import overlay_svg, panel_svg
@@ -29,6 +32,7 @@ from service.console.setup_page import checks
 from service.console.texts import ENGLISH
 from service.console.values import limits_for_people, shown, sigma, target_for_api
 from service.jsonable import jsonable
+from service.schema.mission_file import MissionFile
 from tests.manipulation.arms import T3
 
 ROOT = Path(__file__).parents[3]
@@ -62,7 +66,7 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
                 and isinstance(node.args[0], ast.Constant)
             ):
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
-    built = ("nav.", "mode.", "state.", "verb.", "column.", "stop.")  # keys that are put together
+    built = ("nav.", "mode.", "state.", "verb.", "column.", "stop.", "step.", "did.", "plan.station.")  # put together
     unused = [key for key in ENGLISH if not key.startswith(built) and not re.search(rf"(?m)^{re.escape(key)}$", told)]
     assert unused == []
 
@@ -171,6 +175,39 @@ def test_only_the_own_page_may_use_the_console(headers: dict[str, str], is_allow
 )
 def test_the_relay_passes_on_pictures_and_reports_only(path: str, is_passed: bool) -> None:
     assert (PICTURES.fullmatch(path) is not None) is is_passed
+
+
+def test_missions_are_told_in_plain_words(panel: Panel) -> None:
+    closed = {"object": "main_valve", "state": "closed"}
+    then = {"kind": "set", "name": "turn", "object": "setpoint", "value": 40.0, "on_failure": "skip"}
+    steps = [
+        {"kind": "inspect", "name": "a", "objects": ["pressure", "setpoint"]},
+        {
+            "kind": "choose",
+            "name": "b",
+            "when": [closed, {"object": "pressure", "above": 1.0, "below": 2.0}],
+            "then": [then],
+        },
+        {"kind": "wait_until", "name": "c", "conditions": [closed], "timeout_s": 600.0},
+    ]
+    mission = MissionFile.model_validate_json(json.dumps({"schema": 1, "steps": steps}))
+    told = step_list(mission.model_dump(mode="json", exclude_none=True)["steps"], panel)
+    assert "Reads PRESSURE and SETPOINT from close up." in told
+    assert (
+        "If MAIN VALVE shows closed and PRESSURE is between 1 and 2:<ol><li>Sets SETPOINT to 40. If that fails" in told
+    )
+    assert "Waits until MAIN VALVE shows closed, at most 10 min." in told
+    assert did("close-up", "pressure, flow", panel) == "Reads from close up: PRESSURE, FLOW"
+    assert did("lever main_valve: attempt 1", "", panel) == "Lever MAIN VALVE: attempt 1"
+    assert did("step read", "", None) == "Step read begins"
+
+
+def test_an_unreachable_station_is_told_in_the_plan(panel: Panel) -> None:
+    stations = [{"step": "read", "what": "overview", "way_s": None, "problem": "the floor is in the way"}]
+    plan = {"stations": stations, "is_possible": False, "located": False, "ways_s": 0, "contact_s": 0, "expected_s": 0}
+    told = plan_table("demo", plan, panel)
+    assert "the mission would fail there" in told
+    assert '<td class="bad">the floor is in the way</td>' in told
 
 
 def test_the_set_up_names_what_is_missing_and_the_one_next_step() -> None:

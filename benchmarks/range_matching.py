@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from perception.range import RangeScene, analyse
 from perception.range.matching.match import Match, match_models
-from perception.range.matching.models import shipped_models
+from perception.range.matching.models import load_models
 from perception.range.recordings import sensor_from_meta
 
 MM = 1000.0
@@ -270,7 +270,7 @@ def _angle(true: Array, found: Array, turns: int) -> float:
 def matched(case: MatchingCase) -> tuple[RangeScene, tuple[Match, ...]]:
     """Analyse the scene; return it with the matches of the shipped library."""
     scene = analyse(case.depth_m, sensor_from_meta(case.meta["sensor"], 1 / MM))
-    return scene, match_models(scene, case.depth_m, shipped_models())
+    return scene, match_models(scene, case.depth_m, load_models())
 
 
 def run(

@@ -3,8 +3,9 @@
 `python -m benchmarks.transfers [--first SEED] [--transfers N] [--peers RUNS] [--of EVERY]`
 
 A tour goes from the parking position to standoffs above random objects of a panel, with the fingers at a random turn, and
-to views of it. Plans are judged by a check every 5 mrad. With `--peers` every `EVERY`-th transfer is also planned by OMPL
-(RRT-Connect and its simplifier, RUNS seeds), and all are timed by TOPP-RA; this needs `pip install ompl==2.0.1 toppra`.
+to views of it. Before every second panel two cables hang, as a range image shows them. Plans are judged by a check every
+5 mrad. With `--peers` every `EVERY`-th transfer is also planned by OMPL (RRT-Connect and its simplifier, RUNS seeds), and
+all are timed by TOPP-RA; this needs `pip install ompl==2.0.1 toppra`.
 Times are CPU times of one thread.
 """
 
@@ -20,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from benchmarks.behind_cables import drawn_cable
 from hal.arrays import Array
 from hal.config import load_cell
 from hal.errors import Unreachable
@@ -29,11 +31,12 @@ from hal.strict import validate
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.collision import RECHECK_RAD, CollisionModel, placed
 from manipulation.planning.hand import Hand
-from manipulation.planning.shapes import floor_box, panel_boxes
+from manipulation.planning.shapes import CollisionBox, floor_box, panel_boxes
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.planning.transfer import TransferPlanner
 from manipulation.skills.context import panel_from_grip
 from manipulation.skills.travel import CLEAR_M, ENOUGH_CONDITIONING
+from perception.range import find_obstacles
 from service.sweep.draw import draw_panel
 from simbackend.arm_model import MODELS
 
@@ -41,6 +44,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CELLS = {"t3": "bench", "ur10e": "ur10e", "panda": "panda"}
 LEGS = 8  # of a tour
 STANDOFF_M, VIEW_M, WIDTH_M = 0.03, 0.25, 0.02
+PITCH_M = 0.006
 SPREAD = np.array([0.06] * 3 + [0.14] * 3)
 
 
@@ -79,7 +83,10 @@ def tour(arm: str, seed: int) -> Iterator[Leg]:
     grip = RigidTransform.from_translation([0.0, 0.0, 0.21])
     kinematics = Kinematics.of(MODELS[arm]().capabilities)
     angles = {one.name: angle for one in panel.objects for angle in list(one.resting_angles.values())[:1]}
-    boxes = (floor_box(cell.workspace.floor_z_m), *placed(panel_boxes(panel, angles), base_from_panel))
+    boxes = (
+        floor_box(cell.workspace.floor_z_m),
+        *placed((*panel_boxes(panel, angles), *(_cables(panel, rng) if seed % 2 else ())), base_from_panel),
+    )
     model = CollisionModel.build(kinematics, Hand().capsules(grip, WIDTH_M)).with_boxes(boxes)
     limits = SpeedLimits(tip_m_per_s=cell.safety.speed_limit_m_per_s)
     planner = TransferPlanner(model=model, flange_from_tool=grip, limits=limits, seed=seed)
@@ -90,6 +97,19 @@ def tour(arm: str, seed: int) -> Iterator[Leg]:
         if goal is not None and model.is_clear(here, margin_m=CLEAR_M):
             yield Leg(arm=arm, seed=seed, planner=planner, start_rad=here, goal_rad=goal)
             here = goal
+
+
+def _cables(panel: Panel, rng: np.random.Generator) -> Iterator[CollisionBox]:
+    """Yield the boxes that a range image gives of two random cables."""
+    half = (panel.width_m / 2, panel.height_m / 2)
+    ends = [np.array(drawn_cable(rng, half).path_m) for _ in range(2)]
+    axes = np.vstack([np.linspace(a, b, 60) for path in ends for a, b in itertools.pairwise(path)])
+    x, y = np.meshgrid(*(np.linspace(-side, side, 50) for side in half))
+    seen = np.vstack(
+        [axes + rng.normal(0.0, 0.002, axes.shape), np.column_stack([x.ravel(), y.ravel(), 0.0 * x.ravel()])]
+    )
+    for one in find_obstacles(seen, panel, pitch_m=PITCH_M, sigma_m=0.0006):
+        yield CollisionBox(name="cable", parent_from_box=one.panel_from_box, half_m=one.half_m)
 
 
 def _place(panel: Panel, rng: np.random.Generator) -> RigidTransform:

@@ -18,7 +18,7 @@ from hal.config import Cell
 from hal.geometry import UncertainPose, transform_rpy
 
 if TYPE_CHECKING:
-    from manipulation import Kinematics
+    from manipulation import CollisionBox, Kinematics
     from manipulation.plausibility import FrameDigest
     from perception.vision import ObjectReading
 
@@ -32,6 +32,7 @@ class Facts:
         readings: newest conclusive reading of each object, by the object's name.
         frames: newest frame of each camera and range scanner, by the device's name.
         turned_rad: angle with its whole turns, by name, of each wheel that was turned; a look shows one turn only.
+        obstacles: boxes in the base frame around what stands before the panel; None until it was looked for.
         kinematics: of the cell's arm; None until first needed.
     """
 
@@ -39,6 +40,7 @@ class Facts:
     readings: Mapping[str, ObjectReading] = field(default_factory=lambda: MappingProxyType({}))
     frames: Mapping[str, FrameDigest] = field(default_factory=lambda: MappingProxyType({}))
     turned_rad: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    obstacles: tuple[CollisionBox, ...] | None = None
     kinematics: Kinematics | None = None
 
 
@@ -65,7 +67,7 @@ class WorldModel:
 
     def forget_panel(self) -> None:
         """Drop the panel's pose, because the calibration that it was measured with has changed."""
-        self._change(lambda facts: replace(facts, base_from_panel=None))
+        self._change(lambda facts: replace(facts, base_from_panel=None, obstacles=None))
 
     def note_readings(self, readings: Iterable[ObjectReading]) -> None:
         """Store the conclusive readings in place of earlier ones of the same objects."""
@@ -88,6 +90,15 @@ class WorldModel:
     def note_turned(self, name: str, angle_rad: float) -> None:
         """Store the angle, with its whole turns, to which a wheel was turned."""
         self._change(lambda facts: replace(facts, turned_rad=MappingProxyType({**facts.turned_rad, name: angle_rad})))
+
+    @property
+    def obstacles(self) -> tuple[CollisionBox, ...] | None:
+        """Boxes in the base frame around what stands before the panel; None until it was looked for."""
+        return self._facts.obstacles
+
+    def note_obstacles(self, boxes: tuple[CollisionBox, ...] | None) -> None:
+        """Store what stands before the panel in place of what was found earlier; None if it is to be looked for again."""
+        self._change(lambda facts: replace(facts, obstacles=boxes))
 
     def note_frame(self, device: str, frame: FrameDigest) -> FrameDigest | None:
         """Store the newest frame of a sensor; returns the previous one."""

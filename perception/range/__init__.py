@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from perception.range.cap_height import measure_cap
     from perception.range.matching.cross_check import check_place, outline_px, states_agree
     from perception.range.matching.match import Match, match_models
-    from perception.range.matching.models import load_models, shipped_models
+    from perception.range.matching.models import load_models
     from perception.range.matching.panel_objects import PanelScan, Sighting, find_objects
+    from perception.range.obstacles import find_obstacles
     from perception.range.plane import PlaneFit, fit_plane_near
     from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere, Surface, SurfaceType
     from perception.range.recordings import Reading, assumptions, load_recording
@@ -49,6 +50,7 @@ __all__ = [
     "batch_range",
     "check_place",
     "find_objects",
+    "find_obstacles",
     "fit_plane_near",
     "image_from_sweep",
     "load_models",
@@ -59,7 +61,6 @@ __all__ = [
     "picture",
     "recordings_in",
     "scene_json",
-    "shipped_models",
     "states_agree",
     "warm_up",
     "write_ply",

@@ -6,7 +6,7 @@ import numpy as np
 
 from perception.range.analysis import analyse
 from perception.range.matching.match import match_models
-from perception.range.matching.models import shipped_models
+from perception.range.matching.models import load_models
 from perception.range.plane import fit_plane_near
 from perception.range.sensor import OrthographicSensor, PinholeSensor, RangeSensorModel
 
@@ -30,6 +30,6 @@ def warm_up() -> None:
     sensors: tuple[RangeSensorModel, ...] = (pinhole, parallel)
     for sensor in sensors:
         scene = analyse(depth, sensor)
-        match_models(scene, depth, shipped_models()[:1])
+        match_models(scene, depth, load_models()[:1])
     analyse(depth + 10.0 * noise, pinhole)  # so noisy that larger blocks are used
     fit_plane_near(depth, pinhole, point_m=[0.0, 0.0, 0.61], normal=[0.0, 0.0, -1.0])

@@ -56,13 +56,12 @@ def range_image(
         load_recording,
         match_models,
         scene_json,
-        shipped_models,
         write_ply,
         write_png,
     )
 
     reading = _reading(scale, near, far, focal, centre, pitch)
-    library = () if models is None else shipped_models() if models == "shipped" else load_models(Path(models))
+    library = () if models is None else load_models() if models == "shipped" else load_models(Path(models))
     compile_first()
     depth, sensor = load_recording(file, reading=reading)
     scene = analyse(depth, sensor)

@@ -197,6 +197,12 @@ def scan(session: Session) -> Scan:
     )
 
 
+def has_range_camera(session: Session) -> bool:
+    """Return whether the cell has a range scanner that takes a whole image at once."""
+    names = session.cell.names_of(DeviceKind.RANGE_SCANNER)
+    return bool(names) and not session.connection.device(names[0]).capabilities().needs_sweep
+
+
 def base_from(session: Session, device: str) -> UncertainPose:
     """Return the present pose of a mounted device, with the covariance of its calibration."""
     cell: Cell = session.connection.cell

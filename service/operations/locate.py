@@ -277,6 +277,8 @@ def look_again(session: Session, panel_object: PanelObject) -> PanelShift | None
     shift = shift_between(before, after, panel_object)
     if shift is None:
         session.world.believe_panel(before)
+    else:
+        session.world.note_obstacles(None)
     return shift
 
 

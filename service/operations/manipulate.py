@@ -22,6 +22,7 @@ from perception.vision import ObjectReading, said
 from service.feasibility import target_of, text_of
 from service.operations.inspect import ensure_located, look_close, look_past
 from service.operations.locate import OFF_PLACE_M, look_again
+from service.operations.range_detection import ensure_space_is_known
 from service.operations.session import Session
 from service.operations.travel import park, skill_context
 from service.report.plots import png_of
@@ -52,6 +53,7 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     target = target_of(panel_object, body)
     ensure_located(session)  # a panel that was not found after the deed before is looked for once more
     free_hand(skill_context(session))
+    ensure_space_is_known(session)
     eye = _Eye(session, panel_object, verify)
     before, findings = _look_first(session, eye, panel_object)
     session.observer.told(eye.witness.name, text_of(panel_object, target))
@@ -59,7 +61,6 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     if not report.is_done or eye.is_off_its_place or report.was_missed:
         report, found = _after_doubt(session, eye, panel_object, target, report)
         findings += found
-    reached = report.is_done
     if eye.last is None:
         eye.forget()
     return Deed(
@@ -68,10 +69,10 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
             skill=report.skill,
             target=text_of(panel_object, target),
             outcome=str(report.outcome),
-            detail="; ".join([*findings, *([] if reached else [report.cause])]),
+            detail="; ".join([*findings, *([] if report.is_done else [report.cause])]),
             before="not read" if before is None else said(before),
             after=_after(report) if eye.last is None else said(eye.last),
-            confirmed=reached,
+            confirmed=report.is_done,
             attempts=report.attempts,
             peak_force_n=report.peak_force_n,
             impulse_n_s=report.force.impulse_n_s,
@@ -165,6 +166,7 @@ def _after_doubt(
         return replace(report, outcome=Outcome.UNVERIFIED, cause=cause), [shift.finding]
     if report.outcome is not Outcome.MISSED and (now is None or report.outcome is Outcome.UNVERIFIED):
         return report, [shift.finding]
+    ensure_space_is_known(session)
     again = _operate(session, eye, panel_object, target, now)
     both = replace(
         again,

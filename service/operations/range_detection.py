@@ -2,7 +2,8 @@
 
 This covers the kinds with a relief, such as mushroom buttons and handwheels. An object that is not found, or is found
 in another place, is scanned again from a shorter distance. The panel file is not corrected: an object that is still
-found in another place is reported and not operated. Caps whose states look alike are read by their heights.
+found in another place is reported and not operated. Caps whose states look alike are read by their heights. What stands
+before the panel, such as a cable, is noted for the paths of the arm.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from hal.devices import DeviceKind
-from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable
+from hal.calibration import CameraIntrinsics
+from hal.devices import DeviceKind, RangeScannerCapabilities
+from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable, Unsupported
 from hal.geometry import UncertainPose
 from hal.panel import Cap, Panel, PanelObject
+from manipulation import CollisionBox
 from perception.range import (
     PanelScan,
     RangeScene,
@@ -25,21 +28,24 @@ from perception.range import (
     analyse,
     check_place,
     find_objects,
+    find_obstacles,
     measure_cap,
     outline_px,
     states_agree,
 )
 from perception.vision import ObjectReading, viewpoints
-from service.operations.acquisition import Scan, scan, settle
+from service.operations.acquisition import Scan, device_of_kind, has_range_camera, scan, settle
 from service.operations.locate import ScannedPlane, scan_plate
 from service.operations.session import Session
-from service.operations.travel import go_to_first
+from service.operations.travel import go_to_first, skill_context
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.report.surfaces import Mark, surfaces_picture
 from service.schema.mission_results import SurfaceCheck
 
 OVERVIEW, CLOSER = "the overview", "a closer look"
+VIEW_SLACK_M = 0.0  # around the panel, in a view of all of it
+FLOOR_SLACK_M, HAND_M = 0.03, 0.05  # what is so near to the floor or the finger tips is the floor or the hand
 SURE_ODDS = 6.0  # least logarithm of the odds of a state that a height proves
 
 
@@ -230,6 +236,59 @@ def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
     return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))
 
 
+def ensure_space_is_known(session: Session) -> None:
+    """Look with the range camera for what stands before the panel, unless that was done since it was located.
+
+    A line scanner is not swept for it. Where the camera does not get to see the whole panel, or fails, that is told as
+    progress, and the paths are planned among what the panel file describes.
+
+    Raises:
+        NotFound: the panel has not been located.
+        Stopped, MotionError, Cancelled: the cell cannot go on.
+    """
+    if session.world.obstacles is not None or not has_range_camera(session):
+        return
+    session.world.note_obstacles(())
+    session.progress(0.0, "look for what stands before the panel")
+    try:
+        name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
+        views = viewpoints.overview_poses(
+            session.known_panel().parent_from_child, session.panel, _as_lens(device.capabilities()), VIEW_SLACK_M
+        )
+        back = session.mount(name).parent_from_child.inv()
+        go_to_first(session, (view * back for view in views), name="face the panel with the scanner", thorough=False)
+        settle(session)
+        session.world.note_obstacles(obstacles_in(session, scan(session)))
+    except (DeviceError, PerceptionError, Unreachable, Unsupported) as error:
+        session.progress(1.0, "what stands before the panel is not known", error.what)
+
+
+def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
+    """Return boxes in the base frame around what a range image shows before the panel; see `find_obstacles`."""
+    context, sensor = skill_context(session), image.pinhole()
+    base_from_scanner, base_from_panel = image.base_from_scanner.parent_from_child, context.panel_pose
+    points = sensor.points(np.asarray(image.depth_m, float)).reshape(-1, 3)
+    points = base_from_scanner.apply(points[np.isfinite(points).all(axis=1)])
+    x, y, z = (session.mover.state().base_from_flange * context.flange_from_grip).inv().apply(points).T
+    is_strange = (points[:, 2] > context.floor_z_m + FLOOR_SLACK_M) & ((z > HAND_M) | (np.hypot(x, y) > 2 * HAND_M))
+    found = find_obstacles(
+        base_from_panel.inv().apply(points[is_strange]),
+        session.panel,
+        pitch_m=sensor.pitch_m(float(np.linalg.norm(base_from_scanner.translation - base_from_panel.translation))),
+        sigma_m=image.capabilities.sigma_m,
+    )
+    return tuple(
+        CollisionBox(
+            name="what stands before the panel", parent_from_box=base_from_panel * one.panel_from_box, half_m=one.half_m
+        )
+        for one in found
+    )
+
+
+def _as_lens(c: RangeScannerCapabilities) -> CameraIntrinsics:
+    return CameraIntrinsics(fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy, width_px=c.width, height_px=c.height)
+
+
 def read_by_height(session: Session, readings: Sequence[ObjectReading]) -> dict[str, ObjectReading]:
     """Return new readings of those caps whose height in a range image proves their state.
 
@@ -237,7 +296,7 @@ def read_by_height(session: Session, readings: Sequence[ObjectReading]) -> dict[
     fails: the failure is told as progress, and the caps are looked at from the sides.
     """
     unread = {reading.name: reading for reading in readings if session.panel.object(reading.name).cap is not None}
-    if not unread or not _has_range_camera(session):
+    if not unread or not has_range_camera(session):
         return {}
     proved: dict[str, ObjectReading] = {}
     try:
@@ -249,11 +308,6 @@ def read_by_height(session: Session, readings: Sequence[ObjectReading]) -> dict[
     except (DeviceError, PerceptionError, Unreachable) as error:
         session.progress(1.0, "look past what hides it", f"no range image of {', '.join(unread)}: {error.what}")
     return proved
-
-
-def _has_range_camera(session: Session) -> bool:
-    names = session.cell.names_of(DeviceKind.RANGE_SCANNER)
-    return bool(names) and not session.connection.device(names[0]).capabilities().needs_sweep
 
 
 def _scans(session: Session, caps: Sequence[PanelObject]) -> Iterator[tuple[Scan, tuple[PanelObject, ...]]]:

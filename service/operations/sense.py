@@ -34,6 +34,7 @@ from service.operations.acquisition import settle
 from service.operations.find_panel import locate, panel_observations
 from service.operations.inspect import ensure_located
 from service.operations.locate import go_to_overview, scan_plate
+from service.operations.range_detection import ensure_space_is_known
 from service.operations.session import Session
 from service.operations.travel import skill_context
 from service.schema.fuse_request import FuseRequest
@@ -115,6 +116,7 @@ def feel(session: Session, touches: int, known: Sequence[Observation], tolerance
         NotFound: fewer than three places could be touched, and the pose is not accurate enough; gives the reasons.
         Stopped: somebody stopped the cell.
     """
+    ensure_space_is_known(session)
     return touch_by_plan(session, touch_plan(session, touches, known, tolerance), touches)
 
 

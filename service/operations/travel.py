@@ -123,7 +123,9 @@ def skill_context(session: Session) -> SkillContext:
         park_rad=np.array(file.workspace.park_rad),
         angles_rad=lever_angles(session),
         floor_z_m=file.workspace.floor_z_m,
-        obstacles=() if session.world.base_from_panel is not None else (_where_the_panel_may_be(session),),
+        obstacles=(session.world.obstacles or ())
+        if session.world.base_from_panel is not None
+        else (_where_the_panel_may_be(session),),
         seed=file.cell.seed,
         progress=session.progress,
     )
@@ -219,7 +221,7 @@ class _Planner:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._context = replace(skill_context(session), obstacles=())
+        self._context = replace(skill_context(session), obstacles=session.world.obstacles or ())
         self._state = session.mover.state()
         self._flange_from_camera = session.mount(session.first(DeviceKind.CAMERA)).parent_from_child
         self.stations: list[PlannedStation] = []

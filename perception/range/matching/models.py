@@ -127,13 +127,11 @@ NEEDED = {
 MODEL_KEYS = {"surfaces", "turns", "motion", "motion_axis", "low", "high"}
 
 
-def shipped_models() -> tuple[ComponentModel, ...]:
-    """Return the component models that come with the package (`components.toml`)."""
-    return load_models(Path(__file__).with_name("components.toml"))
+SHIPPED = Path(__file__).with_name("components.toml")
 
 
-def load_models(path: Path) -> tuple[ComponentModel, ...]:
-    """Read the component models of a TOML file.
+def load_models(path: Path = SHIPPED) -> tuple[ComponentModel, ...]:
+    """Read the component models of a TOML file, by default of the one that comes with the package.
 
     Raises:
         ConfigError: the file cannot be read or violates the format; the message names the key.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from perception.range import PinholeSensor
 from perception.range.matching.hypotheses import candidate_of
-from perception.range.matching.models import ComponentModel, models_from, shipped_models
+from perception.range.matching.models import ComponentModel, load_models, models_from
 from perception.range.matching.search import Try, climb, growths_of, refined, ways_of
 from perception.range.matching.solids import boxes_of, hit, render, solid_of
 from perception.range.matching.verify import BEHIND, COVERED, FRONT, HITS, RING, View, explained
@@ -97,7 +97,7 @@ def test_a_grown_surface_covers_more(form):
 
 
 def test_boxes_hold_what_is_drawn():
-    for model in shipped_models():
+    for model in load_models():
         rows, boxes = solid_of(model), boxes_of(model)
         rng = np.random.default_rng(2)
         for x, y in rng.uniform(-0.12, 0.12, (300, 2)):
@@ -145,7 +145,7 @@ def drawn(model: ComponentModel, q: np.ndarray, seed: int = 0) -> View:
 
 def named(name: str) -> ComponentModel:
     """Return a model of the shipped library."""
-    return next(m for m in shipped_models() if m.name == name)
+    return next(m for m in load_models() if m.name == name)
 
 
 def start(model: ComponentModel, *q: float) -> np.ndarray:

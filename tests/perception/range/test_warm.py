@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from perception.range import analyse, fit_plane_near, match_models, shipped_models, warm_up
+from perception.range import analyse, fit_plane_near, load_models, match_models, warm_up
 from perception.range.window import Window
 from tests.perception.range.scenes import PARALLEL, PINHOLE, ball_on_table, noisy
 
@@ -37,7 +37,7 @@ def test_each_loop_has_one_signature_whatever_the_sensor_and_whether_depth_was_c
         codes = np.rint((depth - window.near_m) / window.step_m).astype(np.uint8)
         depth = window.decode(codes)
     scene = analyse(depth.astype(np.float32) if not is_coded else depth, sensor)
-    match_models(scene, depth, shipped_models()[:2])
+    match_models(scene, depth, load_models()[:2])
     fit_plane_near(depth, sensor, point_m=[0.0, 0.0, 0.62], normal=[0.0, -0.5, -0.85], sigma_angle_rad=0.1)
     twice = {name: count for name, count in signatures().items() if count > 1}
     assert not twice

@@ -9,16 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 from benchmarks.behind_cables import drawn_cable, open_session, with_cables
 from hal.config import CableSection, load_cell
 from hal.errors import StaleReading, Unreachable
 from hal.simulated import Fault
+from manipulation.skills.context import panel_from_grip
 from perception.vision import viewpoints
 from perception.vision.reading import ANSWER_AT, ObjectReading, answer_at
-from service.operations import inspect
+from service.operations import inspect, range_detection
 from service.operations.inspect import Inspection, close_ups, inspect_close
 from service.operations.session import Session
+from service.operations.travel import skill_context
 from service.schema.requests import InspectRequest
 
 ROOT = Path(__file__).parents[3]
@@ -145,3 +148,25 @@ def test_the_benchmarks_cables_hang_clear_of_the_plate_from_border_to_border() -
         ends = np.array(cable.path_m)[[0, -1]]
         assert (np.abs(ends[:, :2]) > (0.3, 0.22)).any(axis=1).all()
         assert min(z for _, _, z in cable.path_m) >= 0.028
+
+
+def test_no_transfer_leads_through_a_cable(session: Session) -> None:
+    range_detection.ensure_space_is_known(session)
+    context = skill_context(session)
+    grip = context.panel_pose * panel_from_grip(CABLE.path_m[1], 0.0) * context.flange_from_grip.inv()
+    model = context.collision(width_m=0.0, near_plate=True, may_touch=[one.name for one in session.panel.objects])
+    touching = context.kinematics.inverse(grip)
+    assert len(touching) > 0 and not any(model.is_clear(q, margin_m=0.0) for q in touching)
+    assert all("what stands before the panel" in model.nearest(q) for q in touching)
+
+
+def test_a_plate_that_is_not_where_it_was_located_is_no_obstacle(session: Session) -> None:
+    pose = session.known_panel()
+    nearer = pose.parent_from_child * RigidTransform.from_translation([0.0, 0.0, -0.018])
+    session.world.believe_panel(replace(pose, parent_from_child=nearer))
+    session.world.note_obstacles(None)
+    try:
+        range_detection.ensure_space_is_known(session)
+    finally:
+        session.world.believe_panel(pose)
+    assert session.world.obstacles == ()

@@ -124,7 +124,7 @@ class StopDesk:
             self._latch.note_recorded(state.count)
 
     def reset(self, source: str, *, seen_count: int | None) -> LatchState:
-        """Clear the latch; this alone moves nothing.
+        """Clear the latch; this alone moves nothing. A latch that is clear stays as it is, and running tasks go on.
 
         Args:
             seen_count: the latch's count that the caller has seen; None for whichever stop is older than a second.
@@ -138,6 +138,9 @@ class StopDesk:
             seen_count = self._count_of_old_stop()
         if not self._host.is_alive():
             raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
+        state = self._latch.state()
+        if not state.is_latched and state.count == seen_count:
+            return state
         told = {"source": source, "count": seen_count}
         self._records.commit("stop-reset", told)
         if not self._host.reset(source, seen_count=seen_count):

@@ -55,3 +55,13 @@ def test_no_reset_without_a_stop_port(latch: Latch) -> None:
     with pytest.raises(MotionRefused, match="stop process is down"):
         desk.reset("test", seen_count=desk.stop("a person").count)
     assert latch.is_set()
+
+
+def test_a_reset_of_a_clear_stop_is_no_change_that_could_end_a_task(latch: Latch) -> None:
+    recorded: list[str] = []
+    desk = StopDesk(latch, Host(latch), Records(commit=lambda kind, _data: recorded.append(kind)))
+    clear = desk.reset("test", seen_count=desk.stop("a person").count)
+    assert desk.reset("test", seen_count=clear.count) == desk.reset("test", seen_count=None) == clear
+    assert recorded == ["stop", "stop-reset"]
+    with pytest.raises(MotionRefused, match="pressed again"):
+        desk.reset("test", seen_count=clear.count - 1)

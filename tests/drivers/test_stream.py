@@ -312,6 +312,8 @@ class OnvifDevice(BaseHTTPRequestHandler):
 
     address: ClassVar[str] = ""
     asked: ClassVar[list[bytes]] = []
+    head: ClassVar[str] = ""
+    encoding: ClassVar[str] = "utf-8"
 
     def do_POST(self) -> None:
         question = self.rfile.read(int(self.headers["Content-Length"]))
@@ -321,7 +323,9 @@ class OnvifDevice(BaseHTTPRequestHandler):
             b"GetProfiles": "<p:Profiles xmlns:p='http://m' token='main&amp;1'/><p:Profiles xmlns:p='http://m' token='2'/>",
             b"GetStreamUri": "<u:Uri xmlns:u='http://s'> rtsp://10.0.0.9:554/main </u:Uri>",
         }[next(name for name in (b"GetStreamUri", b"GetProfiles", b"GetCapabilities") if name in question)]
-        answer = f"<s:Envelope xmlns:s='http://e'><s:Body><a>{body}</a></s:Body></s:Envelope>".encode()
+        answer = f"{self.head}<s:Envelope xmlns:s='http://e'><s:Body><a>{body}</a></s:Body></s:Envelope>".encode(
+            self.encoding
+        )
         self.send_response(200)
         self.send_header("Content-Length", str(len(answer)))
         self.end_headers()
@@ -331,15 +335,35 @@ class OnvifDevice(BaseHTTPRequestHandler):
         pass
 
 
-def test_an_onvif_device_tells_its_stream() -> None:
+@contextmanager
+def onvif(head: str = "", encoding: str = "utf-8") -> Iterator[str]:
+    """Serve an ONVIF device whose answers begin with `head`; yields its address."""
     server = ThreadingHTTPServer((ADDRESS, 0), OnvifDevice)
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
     place = f"{ADDRESS}:{server.server_address[1]}"
     OnvifDevice.address, OnvifDevice.asked = f"http://{place}", []
-    assert stream_address(f"onvif://{place}", ("admin", "secret")) == "rtsp://10.0.0.9:554/main"
+    OnvifDevice.head, OnvifDevice.encoding = head, encoding
+    try:
+        yield f"onvif://{place}"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def test_an_onvif_device_tells_its_stream() -> None:
+    with onvif() as place:
+        assert stream_address(place, ("admin", "secret")) == "rtsp://10.0.0.9:554/main"
     assert b"main&amp;1" in OnvifDevice.asked[-1] and b"PasswordDigest" in OnvifDevice.asked[-1]
     assert not any(b"secret" in question for question in OnvifDevice.asked)
-    server.shutdown()
-    server.server_close()
     with pytest.raises(LinkLost, match="ONVIF"):
-        stream_address(f"onvif://{place}", None)
+        stream_address(place, None)
+
+
+@pytest.mark.parametrize(
+    ("declared", "encoding"),
+    [("utf-8", "utf-8"), ("utf-16", "utf-16"), ("utf-16", "utf-16-be"), ("utf-16", "utf-16-le")],
+)
+def test_an_onvif_answer_that_declares_entities_is_refused_in_any_encoding(declared: str, encoding: str) -> None:
+    head = f"<?xml version='1.0' encoding='{declared}'?><!DOCTYPE a [<!ENTITY b 'ha'>]>"
+    with onvif(head, encoding) as place, pytest.raises(NoAnswer, match="not"):
+        stream_address(place, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,13 +38,13 @@ DEFAULT_CELL = Path("cells/bench.toml")
 UrlDefault = DEFAULT_URL
 
 
-def use_key_file(path: Path | None) -> None:
-    """Send the key in this file with all requests of this program; None for the key of the environment, if any."""
-    global _key_file  # noqa: PLW0603 - one option of the whole program
-    _key_file = path
+def use_key_file(path: Path, context: typer.Context) -> None:
+    """Send the key in this file with all requests until the command ends."""
+    before = _key_file.set(path)
+    context.call_on_close(lambda: _key_file.reset(before))
 
 
-_key_file: Path | None = None
+_key_file: ContextVar[Path | None] = ContextVar("key_file", default=None)
 
 
 def client_of(url: str) -> Client:
@@ -54,7 +55,8 @@ def client_of(url: str) -> Client:
     """
     from service.access.keys import key_from_file
 
-    key = os.environ.get("PANELWRIGHT_KEY") if _key_file is None else key_from_file(_key_file)
+    path = _key_file.get()
+    key = os.environ.get("PANELWRIGHT_KEY") if path is None else key_from_file(path)
     ca = os.environ.get("PANELWRIGHT_CA")
     return Client(url=url.rstrip("/"), key=key or None, ca=Path(ca) if ca else None)
 

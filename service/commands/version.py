@@ -19,6 +19,7 @@ def _show(is_asked: bool) -> None:
 
 
 def root(
+    context: typer.Context,
     *,
     version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show)
@@ -36,4 +37,4 @@ def root(
     if key_file is not None:
         from service.commands.common import use_key_file
 
-        use_key_file(key_file)
+        use_key_file(key_file, context)

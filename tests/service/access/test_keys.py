@@ -165,6 +165,16 @@ def test_a_key_file_of_a_client_is_its_users_alone(tmp_path: Path) -> None:
         key_from_file(path)
 
 
+def test_the_key_file_of_one_command_is_not_used_by_the_next(tmp_path: Path) -> None:
+    runner, app = CliRunner(), _app()
+    with_file = runner.invoke(
+        app, ["--key-file", str(tmp_path / "gone.key"), "task", "list", "--url", "http://127.0.0.1:9"]
+    )
+    assert "gone.key" in with_file.output + str(with_file.exception)
+    without = runner.invoke(app, ["task", "list", "--url", "http://127.0.0.1:9"])
+    assert "gone.key" not in without.output + str(without.exception)
+
+
 def test_the_commands_add_list_and_revoke_and_the_journal_has_both(tmp_path: Path) -> None:
     runner, runs, app = CliRunner(), ["--runs", str(tmp_path)], _app()
     done = runner.invoke(app, ["keys", "add", "alice", "--role", "operator", "--valid-for", "90d", *runs])

@@ -22,6 +22,7 @@ from service.client import ApiError
 SILENT_CONNECTIONS = 300
 QUEUED_TASKS = 40
 GARBAGE = 60
+ENDS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 ODD_BODIES = (b'{"objects": NaN}', b"[" * 5000, b'{"a": 1e400}', b'{"a": "\\ud800"}', b"\xff\xfe\x00", b"{}" * 9)
 Undo = Callable[[], None]
 
@@ -199,8 +200,13 @@ def _stop(scene: Scene) -> Broken:
     return Broken(what=f"answered after {1e3 * (time.monotonic() - begun_s):.0f} ms")
 
 
+def ends() -> list[signal.Signals]:
+    """Return the signals that end a service: not those that it inherits as ignored, such as SIGHUP under `nohup`."""
+    return [number for number in ENDS if signal.getsignal(number) is not signal.SIG_IGN]
+
+
 def _end(scene: Scene) -> Broken:
-    taken_s = scene.plant.end(scene.random.choice([signal.SIGTERM, signal.SIGINT, signal.SIGHUP]))
+    taken_s = scene.plant.end(scene.random.choice(ends()))
     return Broken(what=f"gone after {taken_s:.1f} s")
 
 

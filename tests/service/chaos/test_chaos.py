@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from hal.child_python import module_command
 from service.chaos.acks import Ack, missing
-from service.chaos.faults import FAULTS
+from service.chaos.faults import FAULTS, ends
 from service.chaos.judge import last_line, unnamed
 from service.chaos.options import ChaosOptions, Round
 from service.chaos.plant import Plant
@@ -59,6 +60,14 @@ def test_a_motion_under_a_latched_stop_is_found_once_the_arm_had_time_to_rest() 
         sights((0.0, None, 0.0), (late, None, 1.0), (2 * late, None, 2.0)),
     ):
         assert motions_while_latched(still) == []
+
+
+def test_a_signal_that_the_service_would_inherit_as_ignored_is_not_chosen() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert ends() == [signal.SIGTERM, signal.SIGINT]
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def record(kind: str, **data: Any) -> Record:

@@ -65,6 +65,9 @@ class Options:
 class Panelwright:
     """Starts and closes everything that `serve` runs.
 
+    Attributes:
+        is_loaded: set when the modules that compute are imported; requests that may need them wait for that.
+
     Raises:
         ConfigError: a port is in use, or given twice, or strangers could use the service.
         KeysUnusable: the file of keys cannot be used.
@@ -91,7 +94,10 @@ class Panelwright:
         self._error: CellError | None = None
         self._is_settled = threading.Event()
         self._is_ending = threading.Event()
+        self.is_loaded = threading.Event()
         self._wants_warmth = options.warm and not options.inline
+        if not self._wants_warmth:
+            self.is_loaded.set()
         self._server: HttpServer | None = None
         self._listeners = [listener, *for_proxy]
         self._hosts, self._origins = exposure.names_at(self.port)
@@ -215,6 +221,7 @@ class Panelwright:
             stop_url=stop_url,
             cookie=f"panelwright_{self.port}",
             console_url=self.console_url,
+            is_loaded=self.is_loaded.is_set,
         )
 
         def on_exit(why: str) -> None:
@@ -226,15 +233,11 @@ class Panelwright:
 
         tls = (exposure.tls_cert, exposure.tls_key) if exposure.tls_cert and exposure.tls_key else None
         self._server = HttpServer(app, self._listeners, load=load_of_app(app), on_exit=on_exit, tls=tls)
-        if self._wants_warmth:  # at the same time as the cell's start, which waits for another process
-            from service.warm import load_modules
-
-            load_modules()  # here and not in the thread that warms: no task runs before this returns
         freeze_loaded()
         if self._error is not None:
             self._server.stop()  # the cell failed before there was a server to end
         if self._wants_warmth:
-            threading.Thread(target=_warm, name="warm", daemon=True).start()
+            threading.Thread(target=self._warm, name="warm", daemon=True).start()
 
     def _start_service(self) -> None:
         try:
@@ -252,16 +255,22 @@ class Panelwright:
         if self._error is not None and self._server is not None:
             self._server.stop()
 
+    def _warm(self) -> None:
+        """Load the modules that compute, then the compiled kernels, after the cell's start, which needs the processor more.
 
-def _warm() -> None:
-    """Load the compiled kernels before they are needed; an error here is logged and shows again when they are used."""
-    from service.warm import warm
+        What computes waits for the modules; see `service.http.guard`. An error is logged and shows again when they are used.
+        """
+        self._is_settled.wait()
+        from service.warm import load_modules, warm
 
-    try:
-        warm()
-    except Exception:  # raised again, with its context, at the first use
-        log.warning("warming up failed", exc_info=True)
-    freeze_loaded()
+        try:
+            load_modules()
+            self.is_loaded.set()
+            warm()
+        except Exception:  # raised again, with its context, at the first use
+            log.warning("warming up failed", exc_info=True)
+        self.is_loaded.set()
+        freeze_loaded()
 
 
 def is_open_here(options: Options) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -17,6 +18,7 @@ from service.commands.warm import compile_first
 
 if TYPE_CHECKING:
     from service.core import Service
+    from service.exposure import Exposure
     from service.serve import Panelwright
 
 START_PATIENCE_S = 120.0
@@ -75,38 +77,58 @@ def serve(
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
 ) -> None:
     """Start the cell and serve it until Ctrl-C, even if some devices are missing."""
-    from service.core import book_of
-    from service.exposure import Exposure
-    from service.serve import Options, Panelwright
+    from service.processes.early_cell import EarlyCell
 
-    exposure = Exposure(
-        host=host,
-        names=tuple(name or ()),
-        tls_cert=tls_cert,
-        tls_key=tls_key,
-        behind_proxy=behind_proxy,
-        proxies=tuple(proxy or ()),
-        unix_socket=unix_socket,
-    )
-    exposure.check(book_of(runs))  # before the cell file is read and kernels are compiled
-    loaded = read_cell(cell, seed)
-    compile_first()
-    options = Options(
-        exposure=exposure,
-        port=port,
-        stop_port=stop_port,
-        runs_dir=runs,
-        inline=inline,
-        partial=True,
-        warm=warm,
-        record=record,
-        console=console_page,
-        console_port=console_port,
-    )
-    panelwright = Panelwright(loaded, options)
+    with ExitStack() as unfinished:
+        early = None if inline else unfinished.enter_context(closing(EarlyCell()))  # imports while this process does
+        from service.core import book_of
+        from service.serve import Options, Panelwright
+
+        exposure = _exposure(host, name, tls_cert, tls_key, behind_proxy, proxy, unix_socket)
+        exposure.check(book_of(runs))  # before the cell file is read and kernels are compiled
+        loaded = read_cell(cell, seed)
+        compile_first()
+        options = Options(
+            exposure=exposure,
+            port=port,
+            stop_port=stop_port,
+            runs_dir=runs,
+            inline=inline,
+            partial=True,
+            warm=warm,
+            record=record,
+            console=console_page,
+            console_port=console_port,
+        )
+        panelwright = Panelwright(loaded, options)
+        if early is not None:
+            panelwright.service.supervisor.begin_with(early)
+        unfinished.pop_all()
     threading.Thread(target=_announce, args=(panelwright, console_page), daemon=True).start()
     console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")
     run_to_end(panelwright)
+
+
+def _exposure(
+    host: str,
+    names: list[str] | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
+    behind_proxy: bool,
+    proxies: list[str] | None,
+    unix_socket: Path | None,
+) -> Exposure:
+    from service.exposure import Exposure
+
+    return Exposure(
+        host=host,
+        names=tuple(names or ()),
+        tls_cert=tls_cert,
+        tls_key=tls_key,
+        behind_proxy=behind_proxy,
+        proxies=tuple(proxies or ()),
+        unix_socket=unix_socket,
+    )
 
 
 def run_to_end(panelwright: Panelwright) -> NoReturn:

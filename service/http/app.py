@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from fastapi import Depends, FastAPI, Request
+from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
@@ -63,7 +63,13 @@ Poses are named `parent_from_child`; covariances are 6x6 over (dx, dy, dz, rx, r
 
 
 def create_app(
-    service: Service, *, allowed: Allowed, stop_url: str, cookie: str = "panelwright", console_url: str | None = None
+    service: Service,
+    *,
+    allowed: Allowed,
+    stop_url: str,
+    cookie: str = "panelwright",
+    console_url: str | None = None,
+    is_loaded: Callable[[], bool] = lambda: True,
 ) -> ASGIApp:
     """Return the ASGI application of a service, which may still be starting.
 
@@ -72,6 +78,7 @@ def create_app(
         stop_url: address of the stop process, which is shown to clients.
         cookie: name of the cookie of a browser's session.
         console_url: address of the console, likewise; None without one.
+        is_loaded: whether the modules that compute are imported; requests that may need them wait for that.
     """
     state = AppState(
         service=service,
@@ -95,7 +102,19 @@ def create_app(
     )
     app.state.panelwright = state
     app.state.sampler = stream.Sampler(state)
-    routers = (
+    routers = _routers(service)
+    for router in routers:
+        app.include_router(router)
+    app.add_api_route("/openapi.json", _api_document, include_in_schema=False)
+    install(app, paths=[getattr(route, "path", "") for router in routers for route in router.routes])
+    app.mount("/", Page(WEB, app.routes), name="page")
+    bodies = [operation.request_model for operation in service.operations.values()]
+    app.openapi = lambda: _document(app, bodies)  # type: ignore[method-assign]  # the documented way to extend it
+    return RequestGuard(app, allowed=allowed, count=state.metrics.count_answer, is_loaded=is_loaded)
+
+
+def _routers(service: Service) -> tuple[APIRouter, ...]:
+    return (
         verbs.router(dict(service.operations)),
         tasks.router,
         devices.router,
@@ -114,14 +133,6 @@ def create_app(
         health.router,
         stream.router,
     )
-    for router in routers:
-        app.include_router(router)
-    app.add_api_route("/openapi.json", _api_document, include_in_schema=False)
-    install(app, paths=[getattr(route, "path", "") for router in routers for route in router.routes])
-    app.mount("/", Page(WEB, app.routes), name="page")
-    bodies = [operation.request_model for operation in service.operations.values()]
-    app.openapi = lambda: _document(app, bodies)  # type: ignore[method-assign]  # the documented way to extend it
-    return RequestGuard(app, allowed=allowed, count=state.metrics.count_answer)
 
 
 def state_of_app(guarded: ASGIApp) -> AppState:

@@ -20,6 +20,8 @@ MAX_BODY_BYTES = 1_000_000
 LARGE_BODIES = {("POST", "/v1/images"): MAX_IMAGE_BYTES}
 PROXIED = "panelwright.is_proxied"  # whether the request came through the proxy; a key of the ASGI scope
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+PROMPT = ("/v1/info", "/v1/stop", "/v1/lease", "/v1/tasks", "/v1/devices", "/v1/stream")  # need nothing that computes
+LOADED_LOOK_S = 0.02
 SECURITY_HEADERS = [
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
@@ -54,11 +56,14 @@ class RequestGuard:
         load: what the requests use at present.
     """
 
-    def __init__(self, app: FastAPI, *, allowed: Allowed, count: Callable[[int], None]) -> None:
+    def __init__(
+        self, app: FastAPI, *, allowed: Allowed, count: Callable[[int], None], is_loaded: Callable[[], bool]
+    ) -> None:
         self.inner = app
         self._app: ASGIApp = app
         self._allowed = allowed
         self._count = count
+        self._is_loaded = is_loaded
         self.load = Load()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -88,9 +93,21 @@ class RequestGuard:
             busy = problem_response(503, "busy", too_many, hint="wait for their end", retry=Retry.SAFE, headers=again)
             await busy(scope, receive, send)
             return
-        with self.load.request(client), LimitedBody(receive, self.load, most_bytes=_most_bytes(scope)) as body:
+        with self.load.request(client):
+            await self._until_loaded(scope["path"])
+            await self._pass_on(scope, receive, send)
+
+    async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with LimitedBody(receive, self.load, most_bytes=_most_bytes(scope)) as body:
             takes = receive if scope["type"] == "websocket" else body.receive
             await self._app(scope, takes, self._sender(send))
+
+    async def _until_loaded(self, path: str) -> None:
+        """Let a request that may compute wait at the start, because modules and kernels must not load in two threads at once."""
+        if path.startswith(PROMPT) or not path.startswith("/v1/"):
+            return
+        while not self._is_loaded():  # noqa: ASYNC110 - another thread loads
+            await asyncio.sleep(LOADED_LOOK_S)
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str, str] | None:
         if self._allowed.proxies is not None and not scope[PROXIED] and not _is_of_this_machine(scope):

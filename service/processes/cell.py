@@ -260,7 +260,11 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_S)
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     lifeline = Lifeline()
-    order = CellOrder.from_line(lifeline.read_line() or "{}")
+    _in_background(_import_control)
+    line = lifeline.read_line()
+    if line is None:  # the service ended before it had an order
+        kill_own_group()
+    order = CellOrder.from_line(line)
     folder = Path(order.folder)
     vigil = Vigil(folder, lifeline, silence_s=order.silence_s)
     _in_background(vigil.keep)
@@ -300,6 +304,11 @@ def _run(
     runtime.close()
     with contextlib.suppress(OSError):
         server.close()
+
+
+def _import_control() -> None:
+    """Import the control thread's modules, while the order is awaited and devices connect."""
+    from manipulation import Controller  # noqa: F401 - the import is what is wanted
 
 
 def _end_with_parent(lifeline: Lifeline, is_orphan: threading.Event) -> None:

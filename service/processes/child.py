@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import IO
+from typing import IO, NoReturn
 
 from hal.child_python import module_command
 
@@ -144,7 +144,7 @@ class Lifeline:
             pass
 
 
-def kill_own_group() -> None:
+def kill_own_group() -> NoReturn:
     """Kill this process and all its children at once. The process must be a session leader."""
     if os.getpgrp() == os.getpid():
         os.killpg(os.getpid(), signal.SIGKILL)

@@ -20,6 +20,7 @@ from service.processes.cell import CellRuntime
 from service.processes.cell_lines import LOST, MISSING, CellOrder, error_from_line, note_from_line
 from service.processes.child import Child
 from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
+from service.processes.early_cell import EarlyCell, begin_cell
 from service.processes.latch import LATCH, Latch, LatchState
 from service.processes.runtime_folder import RuntimeFolder
 from service.processes.stop_desk import Records, StopDesk, StopHost
@@ -102,6 +103,7 @@ class Supervisor:
         self._remote = RemoteConnection(cell)
         self._local: LocalConnection | None = None
         self._child: Child | None = None
+        self._early: EarlyCell | None = None
         self._restarts = 0
         self._short_lives = 0
         self._lost_since_s: float | None = None
@@ -146,6 +148,10 @@ class Supervisor:
     def missing(self) -> tuple[MissingDevice, ...]:
         """Devices that have not connected, neither at the cell's start nor later."""
         return tuple(self._missing.values())
+
+    def begin_with(self, early: EarlyCell) -> None:
+        """Use a cell process that runs already as the first one, and own it from now on."""
+        self._early = early
 
     def start(self) -> None:
         """Start the cell and wait until it is ready; in a simulated or replayed cell, reset the latch afterwards.
@@ -216,6 +222,8 @@ class Supervisor:
             child = self._child
         if child is not None:
             child.end()
+        if self._early is not None:
+            self._early.close()
         self._remote.close()
         self._watching.set()
         self._stop.close()
@@ -307,9 +315,11 @@ class Supervisor:
         with self._lock:
             if self._is_closing.is_set():
                 raise DeviceUnavailable("the service is ending", hint="start it again", device="cell")
-            self._temporary.mkdir(exist_ok=True)
-            own = {"TMPDIR": str(self._temporary)}  # so that nothing remains of a cell that is killed
-            self._child = Child("service.processes.cell", environment=own, on_line=on_line, on_exit=on_exit)
+            if self._early is not None and self._child is None:
+                self._child = self._early.take(on_line, on_exit)
+            else:
+                self._temporary.mkdir(exist_ok=True)
+                self._child = begin_cell(self._temporary, on_line, on_exit)
             return self._child
 
     def _look(self) -> None:

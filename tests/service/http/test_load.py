@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 
 import httpx2
@@ -129,3 +130,17 @@ def test_requests_in_work_are_counted_by_client_and_overall(monkeypatch: pytest.
             assert "3 requests are in work" in str(load.refusal("/v1/tasks", "c"))
             assert load.refusal("/v1/stop", "a") is None
     assert load.refusal("/v1/tasks", "a") is None
+
+
+def test_what_computes_waits_for_its_modules_and_nothing_else_does(served: Panelwright, client: httpx2.Client) -> None:
+    served.is_loaded.clear()
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            waiting = pool.submit(client.get, "/v1/knowledge")
+            for path in ("/healthz", "/readyz", "/v1/info", "/v1/tasks", "/v1/devices", "/v1/stop", "/v1/lease"):
+                assert client.get(path).status_code == 200, path
+            assert client.post("/v1/stop").json()["is_latched"]
+            assert not waiting.done()
+        finally:
+            served.is_loaded.set()
+        assert waiting.result(30.0).status_code == 200

@@ -119,7 +119,11 @@ class Panelwright:
         self.console: ConsoleHost | None = None
         if console is not None:
             self.console = ConsoleHost(
-                console, service_url=self.url, stop_port=self.stop_port, report=self.service.note
+                console,
+                service_url=self.url,
+                stop_port=self.stop_port,
+                report=self.service.note,
+                keep=self.service.lease.subs.all_kept,
             )
 
     @property

@@ -36,6 +36,10 @@ def install(place: Place) -> None:
             ui.html(say("devices.heading"), sanitize=False, tag="h2")
             listed = ui.html("", sanitize=False)
             live(picks(listed, connect, what="connect"), values.table)
+            live(
+                ui.html("", sanitize=False, tag="p").classes("quiet"),
+                lambda: say("devices.sim") if is_sim(mirror) else "",
+            )
         ui.timer(READ_S, values.read)
 
 
@@ -60,9 +64,10 @@ class _Values:
                 self._readings.pop(name, None)
                 continue
             before = self._readings.get(name)
-            if before is not None and fresh["host_time_s"] > before["host_time_s"]:
+            if before is not None:
+                passed_s = fresh["host_time_s"] - before["host_time_s"]
                 counted = fresh["sequence"] - before["sequence"]
-                self._rates_hz[name] = counted / (fresh["host_time_s"] - before["host_time_s"])
+                self._rates_hz[name] = counted / passed_s if passed_s > 0.0 else 0.0
             self._readings[name] = fresh
 
     def table(self) -> str:
@@ -81,21 +86,45 @@ class _Values:
         again = "" if health["connected"] else (
             f'<button type="button" class="plain" data-connect="{name}">{say("device.connect")}</button>'
         )  # fmt: skip
-        value = say("device.picture") if device["kind"] in PICTURES else in_words(reading["value"]) if reading else "–"
-        rate = (
-            "–"
-            if rate_hz is None
-            else say("device.rate", rate=f"{rate_hz:.0f}")
-            if rate_hz > 0
-            else say("device.no_rate")
-        )
+        value = "–" if reading is None else shown_value(device["kind"], reading["value"])
+        if device["kind"] in PICTURES:
+            value = say("device.picture")
         aged = "–" if reading is None or reading["age_s"] is None else f"{reading['age_s']:.2f} s"
         return (
             f"<tr><td><b>{attribute(name)}</b></td><td>{attribute(device['kind'].replace('_', ' '))}</td>"
             f'<td class="quiet">{attribute(device["driver"])}</td>'
-            f'<td class="{"good" if is_good else "bad"}">{attribute(quality)}</td><td>{attribute(value)}</td><td>{rate}</td>'
+            f'<td class="{"good" if is_good else "bad"}">{attribute(quality)}</td><td>{attribute(value)}</td>'
+            f"<td>{attribute(self._rate(device, rate_hz))}</td>"
             f'<td>{aged}</td><td>{attribute(fault)} <span class="quiet">{counts}</span> {again}</td></tr>'
         )
+
+    def _rate(self, device: dict[str, Any], rate_hz: float | None) -> str:
+        """Return how fast readings come, on the cell's clock, or why there is no such number."""
+        if device["kind"] in PICTURES:
+            return say("device.on_demand")
+        if rate_hz is None:
+            return "–"
+        if rate_hz > 0.0:
+            return say("device.rate", rate=f"{rate_hz:.0f}")
+        return say("device.clock_stands" if is_sim(self._mirror) else "device.no_rate")
+
+
+def is_sim(mirror: Mirror) -> bool:
+    """Return whether the whole cell is simulated."""
+    info = mirror.said("info")
+    return info is not None and info["mode"] == "sim"
+
+
+def shown_value(kind: str, value: Any) -> str:
+    """Return a device's value with its units and the names of its parts, which a bare number or list does not carry."""
+    if kind == "proximity" and isinstance(value, int | float):
+        return say("device.distance", distance=f"{value:.3f}")
+    if kind == "touch" and isinstance(value, list) and len(value) == 2:
+        left, right = (in_words(one) for one in value)
+        return say("device.touch", left=left, right=right)
+    if kind == "lights" and isinstance(value, list):
+        return say("device.lights", states=" ".join(say("device.on" if one else "device.off") for one in value))
+    return in_words(value)
 
 
 def in_words(value: Any) -> str:

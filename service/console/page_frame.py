@@ -16,7 +16,14 @@ from service.console.mirror import Mirror
 from service.console.texts import say, word
 from service.console.values import STALE_S, attribute
 
-PAGES = {"panel": "/", "missions": "/missions", "devices": "/devices", "setup": "/setup", "cell": "/cell"}
+PAGES = {
+    "panel": "/",
+    "missions": "/missions",
+    "alarms": "/alarms",
+    "devices": "/devices",
+    "setup": "/setup",
+    "cell": "/cell",
+}
 REFRESH_S = 0.25
 # A click or the Enter key on something that carries the name of an object.
 PICK = (
@@ -126,9 +133,15 @@ def table(columns: list[str], rows: list[str], *, name: str, empty: str = "") ->
     """Return an HTML table called `name`; `columns` are keys of texts, `rows` are HTML."""
     if not rows:
         return f'<p class="quiet">{attribute(empty)}</p>'
-    head = "".join(f'<th scope="col">{attribute(say(f"column.{name}"))}</th>' for name in columns)
+    head = "".join(_head(column) for column in columns)
     body = f'<table class="list"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     return f'<div class="scroll" tabindex="0" role="group" aria-label="{attribute(name)}">{body}</div>'
+
+
+def _head(column: str) -> str:
+    """Return the head of a column; one of buttons has none."""
+    told = say(f"column.{column}")
+    return f'<th scope="col">{attribute(told)}</th>' if told else "<td></td>"
 
 
 def clock(seconds: float | None) -> str:

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import Any
 
 from service.processes.child import Child
@@ -14,6 +15,7 @@ from service.processes.child import Child
 MODULE = "service.console.process"  # named and not imported: the web framework stays out of this process
 SETTLED_S = 20.0  # a console that lived so long is started again at once
 LONGEST_PAUSE_S = 30.0
+BRIDGE_S = 60.0  # so long does a motion wait for a console that does not come back
 log = logging.getLogger(__name__)
 
 
@@ -25,6 +27,7 @@ class ConsoleHost:
         service_url: address of the HTTP API.
         stop_port: port of the stop process.
         report: where unexpected ends are recorded.
+        keep: keeps the motions that run, while the console that followed them is started again.
         module: what to run.
     """
 
@@ -35,11 +38,14 @@ class ConsoleHost:
         service_url: str,
         stop_port: int,
         report: Callable[[str, dict[str, Any]], None],
+        keep: Callable[[], AbstractContextManager[None]] = nullcontext,
         module: str = MODULE,
     ) -> None:
         self._listener = listener
         self._arguments = ["--fd", str(listener.fileno()), "--service", service_url, "--stop-port", str(stop_port)]
         self._report = report
+        self._keep = keep
+        self._bridge = ExitStack()
         self._module = module
         self._lock = threading.Lock()
         self._is_closing = threading.Event()
@@ -64,7 +70,7 @@ class ConsoleHost:
                 self._module,
                 self._arguments,
                 pass_fds=[self._listener.fileno()],
-                on_line=lambda _line: self._is_ready.set(),
+                on_line=lambda _line: self._answers(),
                 on_exit=self._exited,
             )
 
@@ -79,13 +85,32 @@ class ConsoleHost:
             child = self._child
         if child is not None:
             child.end(grace_s=1.0)
+        self._let_go()
         self._listener.close()
+
+    def _answers(self) -> None:
+        self._is_ready.set()
+        self._let_go()
+
+    def _hold_on(self) -> None:
+        """Keep the motions that run, for a bounded time."""
+        self._let_go()
+        bridge = ExitStack()
+        bridge.enter_context(self._keep())
+        self._bridge = bridge
+        timer = threading.Timer(BRIDGE_S, bridge.close)
+        timer.daemon = True
+        timer.start()
+
+    def _let_go(self) -> None:
+        self._bridge.close()
 
     def _exited(self, code: int) -> None:
         self._is_ready.clear()
         child = self._child
         if self._is_closing.is_set() or child is None:
             return
+        self._hold_on()
         log.warning("the console ended with code %d; it is started again", code)
         self._report("console-process-down", {"code": code})
         lived_s = time.monotonic() - child.started_s

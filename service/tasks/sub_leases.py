@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 
 from hal.clock import Clock
@@ -87,6 +87,14 @@ class SubLeases:
             with self._lock:
                 sub.keepers -= 1
                 sub.ends_s = self._clock.now_s() + self.window_s
+
+    @contextmanager
+    def all_kept(self) -> Iterator[None]:
+        """Keep all sub-leases that are lent now, while a client that followed their tasks is started again."""
+        with ExitStack() as kept:
+            for sub in self.all():
+                kept.enter_context(self.kept(sub))
+            yield
 
     def lose(self, subs: list[SubLease], reason: str) -> None:
         """End these sub-leases and cancel their tasks."""

@@ -33,9 +33,11 @@ name = "setpoint"
 label = "SETPOINT"
 position_m = [0.0, -0.12]
 travel_m = 0.1
+limits = { high = 90.0 }
+what_to_do = "slide it back"
 scale = { minimum = 0.0, maximum = 100.0, unit = "%", at_min = -0.05, at_max = 0.05 }
 """
-PAGES = ("/", "/missions", "/devices", "/setup", "/cell")
+PAGES = ("/", "/missions", "/alarms", "/devices", "/setup", "/cell")
 
 
 def until(page: Any, claim: str) -> None:
@@ -130,7 +132,7 @@ class Cell:
         return EchoResult(text="", number=request.value, nothing=None)
 
     def record(self, value: float) -> None:
-        """Store a reading of the slider."""
+        """Store a reading of the slider, and judge it by its limits."""
         given = {
             "object": "setpoint",
             "kind": "slider",
@@ -139,7 +141,9 @@ class Cell:
             "confidence": 0.9,
             "utc_s": time.time(),
         }
-        self.service.service.plant.history.add([reading(0, value, **given)])
+        stored = reading(0, value, **given)
+        self.service.service.plant.history.add([stored])
+        self.service.service.plant.alarms.take([stored])
 
 
 @pytest.fixture(scope="module")
@@ -186,6 +190,26 @@ def test_an_object_is_opened_read_and_set_only_after_a_yes(page: Any, cell: Cell
     assert [(one.object, one.value) for one in cell.asked[1:]] == [("setpoint", 62.0)]
     page.click("button:text-is('Close')")
     page.wait_for_selector(".dialog", state="hidden")
+
+
+def test_an_alarm_is_acknowledged_and_shelved_with_a_reason(page: Any, cell: Cell) -> None:
+    cell.record(95.0)
+    page.goto(f"{cell.url}/alarms")
+    until(page, "document.querySelector('tbody').textContent.includes('slide it back')")
+    page.click("button:text-is('Acknowledge')")
+    until(page, "document.body.textContent.includes('Give your name first')")
+    page.fill("input[aria-label='Your name, for the record']", "alice")
+    page.click("button:text-is('Acknowledge')")
+    until(page, "document.querySelector('tbody').textContent.includes('acknowledged')")
+    page.click("button:text-is('Shelve …')")
+    page.click("button:text-is('Shelve')")
+    until(page, "document.querySelector('.dialog').textContent.includes('Give a reason')")
+    page.fill(".dialog input[aria-label=Reason]", "test run")
+    page.click("button:text-is('Shelve')")
+    until(page, "document.querySelector('tbody').textContent.includes('alice: test run')")
+    shelved = next(one for one in cell.service.service.plant.alarms.all() if one.id == "setpoint.high")
+    assert (str(shelved.state), shelved.by, shelved.reason) == ("shelved", "alice", "test run")
+    assert 7.9 * 3600 < (shelved.shelved_until_s or 0.0) - time.time() < 8.1 * 3600
 
 
 def test_a_mission_is_chosen_planned_and_taken_up_where_it_ended(page: Any, cell: Cell) -> None:

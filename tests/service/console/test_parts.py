@@ -20,6 +20,7 @@ from hal.camera_model import project
 from hal.panel import NumberGoal, Panel, load_panel
 from manipulation import Kinematics
 from service.console.cell_page import joint_frames
+from service.console.devices_page import shown_value
 from service.console.mirror import Mirror
 from service.console.mission_words import did, step_list
 from service.console.missions_page import plan_table
@@ -66,7 +67,21 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
                 and isinstance(node.args[0], ast.Constant)
             ):
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
-    built = ("nav.", "mode.", "state.", "verb.", "column.", "stop.", "step.", "did.", "plan.station.")  # put together
+    built = (
+        "nav.",
+        "mode.",
+        "state.",
+        "verb.",
+        "column.",
+        "stop.",
+        "step.",
+        "did.",
+        "plan.station.",
+        "alarm",
+        "alarms.do.",
+        "alarms.ask.",
+        "alarms.confirm.",
+    )  # put together
     unused = [key for key in ENGLISH if not key.startswith(built) and not re.search(rf"(?m)^{re.escape(key)}$", told)]
     assert unused == []
 
@@ -208,6 +223,14 @@ def test_an_unreachable_station_is_told_in_the_plan(panel: Panel) -> None:
     told = plan_table("demo", plan, panel)
     assert "the mission would fail there" in told
     assert '<td class="bad">the floor is in the way</td>' in told
+
+
+def test_values_of_devices_have_units_and_names() -> None:
+    assert shown_value("proximity", 0.47931) == "0.479 m"
+    assert shown_value("touch", [False, True]) == "left no, right yes"
+    assert shown_value("lights", [True, False]) == "lights on off"
+    assert shown_value("gripper", {"width_m": 0.04, "is_moving": False}) == "width 0.04 m, moving no"
+    assert shown_value("force_torque", {"force_n": [1.0, 2.5, 0.0]}) == "force 1 2.5 0 N"
 
 
 def test_the_set_up_names_what_is_missing_and_the_one_next_step() -> None:

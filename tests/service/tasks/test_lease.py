@@ -13,6 +13,7 @@ from hal.clock import SimClock
 from hal.errors import LeaseError
 from service.errors import JournalError, StaleEpoch
 from service.tasks.lease import Grant, LeaseDesk
+from service.tasks.sub_leases import SubLeases
 
 TTL_S = 2.0
 
@@ -239,3 +240,20 @@ class LeaseLife(RuleBasedStateMachine):
 
 
 TestLeaseLife = LeaseLife.TestCase
+
+
+def test_a_motion_is_kept_while_its_follower_is_started_again_and_ends_without_it() -> None:
+    clock, lost = SimClock(), list[str]()
+    subs = SubLeases(clock)
+    sub = subs.lend(1, is_own=True)
+    sub.on_loss = lost.append
+    with subs.all_kept():
+        clock.sleep(5 * subs.window_s)
+        subs.expire()
+        assert lost == [], "the console that follows it may take long to start"
+    clock.sleep(0.9 * subs.window_s)
+    subs.expire()
+    assert lost == []
+    clock.sleep(0.2 * subs.window_s)
+    subs.expire()
+    assert len(lost) == 1

@@ -31,8 +31,8 @@ CABLE = CableSection(path_m=((0.06, 0.3, 0.05), (0.098, 0.118, 0.03), (0.16, 0.0
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    """Yield a session with the panel of seed 3 located and a cable in front of its display."""
-    cell = with_cables(load_cell(ROOT / "cells/bench.toml", seed=3), CABLE)
+    """Yield a session with the panel of seed 9 located and a cable in front of its display."""
+    cell = with_cables(load_cell(ROOT / "cells/bench.toml", seed=9), CABLE)
     with open_session(cell, tmp_path_factory.mktemp("look-past")) as session:
         yield session
 
@@ -79,7 +79,7 @@ def test_a_cap_that_looks_alike_from_afar_is_read_by_its_height(session: Session
     straight = close_ups(session, ("hold",))
     assert not straight.readings["hold"].answered, "a black cap in a black ring"
     found = inspect.look_past(session, straight)
-    assert found.readings["hold"].state == truth_of(session, "hold").state == "pressed"
+    assert found.readings["hold"].state == truth_of(session, "hold").state == "released"
     assert len(found.pictures) == len(straight.pictures), "no look from a side is needed"
 
 
@@ -91,11 +91,9 @@ def test_a_scanner_that_fails_leaves_the_cap_to_looks_from_close_by(session: Ses
         found = inspect.look_past(session, straight)
     finally:
         scanner.inject_fault(None)
-    looks = len(found.pictures) - len(straight.pictures)
-    assert 1 <= looks <= len(viewpoints.CLOSE_SIDES)
-    assert "close by" in found.pictures[len(straight.pictures)].title
-    reading = found.readings["hold"]
-    assert reading.state == "pressed" or f"({looks} views from the sides did not help)" in (reading.reason or "")
+    looks = [picture.title for picture in found.pictures[len(straight.pictures) :]]
+    assert len(looks) == 1 and "close by" in looks[0], "the first look from close by shows it"
+    assert found.readings["hold"].state == truth_of(session, "hold").state == "released"
 
 
 def test_neighbours_that_cannot_be_read_are_looked_at_together(session: Session) -> None:

@@ -12,7 +12,7 @@ from hal.calibration import CalibrationRecord, Vector3, load_calibration
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from hal.panel import Panel, load_panel
-from hal.plant import HistorySection, RoundSection
+from hal.plant import HistorySection, ReviewSection, RoundSection
 from hal.simulated_events import EventSection
 from hal.strict import Strict, load_toml
 
@@ -190,6 +190,7 @@ class CellFile(Strict):
     safety: SafetySection = SafetySection()
     simulation: SimulationSection = SimulationSection()
     history: HistorySection = HistorySection()
+    review: ReviewSection = ReviewSection()
     rounds: Annotated[tuple[RoundSection, ...], Field(max_length=100)] = ()
     emulators: dict[Name, EmulatorSection] = {}
 

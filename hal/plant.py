@@ -1,4 +1,4 @@
-"""Sections of the cell file about what outlives a mission: the history of readings, and the rounds."""
+"""Sections of the cell file about what outlives a mission: the history of readings, its review, and the rounds."""
 
 from __future__ import annotations
 
@@ -25,6 +25,14 @@ class HistorySection(Strict):
             description="readings that leave the database go to Parquet files, which nothing deletes, instead of away"
         ),
     ] = False
+
+
+class ReviewSection(Strict):
+    """`[review]`: which readings a person is asked about."""
+
+    sure_at: Annotated[
+        float, Field(ge=0.5, le=1.0, description="least confidence of a reading that needs no person")
+    ] = 0.8
 
 
 class RoundSection(Strict):

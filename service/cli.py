@@ -43,7 +43,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import alarms, calibrate, devices, init, keys, missions, rounds, serve, tasks
+    from service.commands import alarms, calibrate, devices, init, keys, missions, review, rounds, serve, tasks
     from service.commands.backup import backup, restore
     from service.commands.chaos import chaos
     from service.commands.check import check
@@ -84,6 +84,7 @@ def _app() -> Callable[[], None]:
     app.command()(history)
     app.add_typer(alarms.app, name="alarms")
     app.add_typer(rounds.app, name="rounds")
+    app.add_typer(review.app, name="review")
     app.add_typer(keys.app, name="keys")
     plain = (backup, restore, conform, warm, teach, learn, read)
     for command in plain:

@@ -1,4 +1,4 @@
-"""What a service keeps and watches beyond its tasks: the history, the alarms and the rounds of one cell."""
+"""What a service keeps and watches beyond its tasks: the history with its review, the alarms and the rounds of one cell."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from hal.errors import CellError, ConfigError
 from hal.plant import RoundSection
 from service.alarms.desk import AlarmDesk
 from service.history.observer import Observations
+from service.history.reading import StoredReading
 from service.history.store import History
 from service.missions.files import checked_file
+from service.review.desk import ReviewDesk
+from service.review.doubts import Doubts
 from service.rounds.book import RoundBook
 from service.rounds.cell import RunningCell
 from service.rounds.keeper import RoundKeeper
@@ -26,7 +29,7 @@ Record = Callable[[str, dict[str, Any]], None]
 
 
 class Plant:
-    """The history, the alarms and the rounds.
+    """The history, its review, the alarms and the rounds.
 
     Args:
         state_dir: folder of their files.
@@ -41,7 +44,9 @@ class Plant:
         self._cell = cell
         self.history = self._open_history(state_dir / "history", note)
         self.alarms = self._open_alarms(state_dir / "alarms.json", journal, commit)
-        self.observations = Observations(history=self.history, listeners=[self.alarms.take])
+        self.review = ReviewDesk(self.history, cell.panel, cell=cell.name, commit=commit)
+        doubts = Doubts(cell.panel, sure_at=cell.file.review.sure_at, earlier=self._newest())
+        self.observations = Observations(history=self.history, listeners=[self.alarms.take], doubt_of=doubts.of)
         self._is_closing = threading.Event()
         self.check_rounds(cell.file.rounds, source=str(cell.path))
         self._book = RoundBook(state_dir / "rounds" / f"{cell.name}.sqlite")
@@ -86,6 +91,9 @@ class Plant:
         if faults:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise ConfigError(f"{source}: {faults[0]}{more}", hint="correct the rounds", faults=faults)
+
+    def _newest(self) -> list[StoredReading]:
+        return [row.reading for row in self.history.reader().newest(self._cell.name)]
 
     def _is_active(self, alarm: str) -> bool:
         return self.alarms.get(alarm).is_active

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from service.history.reading import StoredReading, answer_of
@@ -55,11 +55,13 @@ class Observations:
 
     Attributes:
         listeners: called with readings after they were stored, for example to raise alarms.
+        doubt_of: returns why a person should look at a reading; empty for one that is sure.
         targets: what each object was last told to be.
     """
 
     history: History
     listeners: list[Callable[[Sequence[StoredReading]], None]] = field(default_factory=list)
+    doubt_of: Callable[[StoredReading], str] = lambda _reading: ""
     targets: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -98,6 +100,7 @@ class TaskObserver:
             )
             for reading in readings
         ]
+        stored = [replace(one, doubt=self._kept.doubt_of(one)) for one in stored]
         self._kept.history.add(stored)
         for listen in self._kept.listeners:
             listen(stored)

@@ -20,7 +20,12 @@ if TYPE_CHECKING:
     import duckdb
 
 PART = re.compile(r"readings-(\d{12})-(\d{12})\.parquet")
-NUMBERS = ("utc_s", "cell_s", "value", "sigma", "confidence")
+NUMBERS = ("utc_s", "cell_s", "value", "sigma", "confidence", "final_value")
+# Columns that parts of version 1 do not have.
+NEWER = (
+    "SELECT '' AS doubt, NULL::VARCHAR AS answered, NULL::DOUBLE AS final_value, NULL::VARCHAR AS final_state, "
+    "NULL::VARCHAR AS final_text LIMIT 0"
+)
 
 
 def need_engine() -> None:
@@ -118,7 +123,9 @@ def read_parts(parts: Sequence[Path], what: str, where: str, values: Sequence[An
     database = engine()
     try:
         found: list[tuple[Any, ...]] = database.execute(
-            f"SELECT {what} FROM read_parquet([{files}]) {where}", list(values)
+            f"WITH parts AS (({NEWER}) UNION ALL BY NAME SELECT * FROM read_parquet([{files}], union_by_name=true)), "
+            f"readings AS (SELECT * REPLACE (COALESCE(doubt, '') AS doubt) FROM parts) SELECT {what} FROM readings {where}",
+            list(values),
         ).fetchall()
     except failure() as error:
         what_failed = f"one of the {len(parts)} Parquet files in {parts[0].parent} cannot be read: {error}"

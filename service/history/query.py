@@ -139,6 +139,18 @@ class Reader:
             ).fetchall()
         return [_row(row) for row in rows]
 
+    def waiting(self, cell: str, *, limit: int = 100) -> list[Row]:
+        """Return the readings of the database that wait for a person, newest first."""
+        asked = f"SELECT {SELECTED} FROM readings WHERE cell = ? AND doubt != '' AND answered IS NULL ORDER BY id DESC LIMIT ?"
+        with self._open() as db:
+            return [_row(row) for row in db.execute(asked, (cell, limit)).fetchall()]
+
+    def count_waiting(self, cell: str) -> int:
+        """Return how many readings wait for a person."""
+        with self._open() as db:
+            asked = "SELECT COUNT(*) FROM readings WHERE cell = ? AND doubt != '' AND answered IS NULL"
+            return int(db.execute(asked, (cell,)).fetchone()[0])
+
     def told(self, cell: str) -> dict[str, str]:
         """Return what each object was told to be when it was read last."""
         return {row.reading.object: row.reading.told for row in self.newest(cell) if row.reading.told is not None}
@@ -178,10 +190,24 @@ class Reader:
 
 
 def _sums(number: str) -> str:
-    """Return the columns of a trend: bucket, what was shown in words, counts, extremes and sum of the values."""
+    """Return the columns of a trend: bucket, what was shown in words, counts, extremes and sum of the values.
+
+    What a person has said about a reading takes the place of what was read.
+    """
+    value, words, refused = (
+        f"CASE WHEN answered IS NULL THEN {read} ELSE {said} END"
+        for read, said in (
+            ("value", "final_value"),
+            ("COALESCE(state, text)", "COALESCE(final_state, final_text)"),
+            (
+                f"CASE WHEN quality = '{INVALID}' THEN 1 ELSE 0 END",
+                "CASE WHEN COALESCE(CAST(final_value AS VARCHAR), final_state, final_text) IS NULL THEN 1 ELSE 0 END",
+            ),
+        )
+    )
     return (
-        f"{number}, CASE WHEN value IS NULL THEN COALESCE(state, text) END, COUNT(*), "
-        f"SUM(CASE WHEN quality = '{INVALID}' THEN 1 ELSE 0 END), MIN(value), MAX(value), SUM(value), COUNT(value)"
+        f"{number}, CASE WHEN ({value}) IS NULL THEN ({words}) END, COUNT(*), "
+        f"SUM({refused}), MIN({value}), MAX({value}), SUM({value}), COUNT({value})"
     )
 
 

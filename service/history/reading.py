@@ -31,6 +31,9 @@ class StoredReading:
         phase: the part of the work at which it was taken, such as `before the actions`.
         told: what the object was last told to be; None if it never was.
         crop: SHA-256 of the picture of the object; None if there is none.
+        doubt: why a person should look at it, as a sentence; empty for a reading that is sure.
+        answered: what a person has said about it, as JSON; None as long as nobody has.
+        final_value, final_state, final_text: what it shows by that answer; all None if that could not be told.
     """
 
     object: str
@@ -53,11 +56,21 @@ class StoredReading:
     phase: str = ""
     told: str | None = None
     crop: str | None = None
+    doubt: str = ""
+    answered: str | None = None
+    final_value: float | None = None
+    final_state: str | None = None
+    final_text: str | None = None
 
     @property
     def is_valid(self) -> bool:
         """Whether the reading was given and not refused."""
         return self.quality == VALID
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it was given, and nothing speaks against it."""
+        return self.is_valid and not self.doubt
 
 
 COLUMNS = tuple(field.name for field in fields(StoredReading))

@@ -13,10 +13,11 @@ from pathlib import Path
 
 from hal.errors import CellError
 from hal.plant import HistorySection
+from service.errors import NoSuchTask, NotPossibleNow
 from service.history.crops import Crops
 from service.history.database import cannot_write, is_damaged, open_history, set_aside_beside
 from service.history.parts import ids_of, need_engine, part_path, parts_of, write_parquet
-from service.history.query import Query, Reader
+from service.history.query import Query, Reader, Row
 from service.history.reading import COLUMNS, StoredReading
 
 DAY_S = 86_400.0
@@ -97,6 +98,47 @@ class History:
                 self._begin_anew()
                 self._retry(rows)
         self._trim_if_due()
+
+    def answer(self, reading_id: int, *, said: str, value: float | None, state: str | None, text: str | None) -> Row:
+        """Store what a person says about a reading, beside what was read; returns the reading as it is now.
+
+        Args:
+            said: the answer as JSON.
+            value, state, text: what the reading shows by that answer.
+
+        Raises:
+            NoSuchTask: there is no such reading in the database.
+            NotPossibleNow: nobody asked about it, or it is answered already.
+            HistoryError: it could not be stored.
+        """
+        with self._lock:
+            try:
+                changed = self._db.execute(
+                    "UPDATE readings SET answered = ?, final_value = ?, final_state = ?, final_text = ? "
+                    "WHERE id = ? AND cell = ? AND doubt != '' AND answered IS NULL",
+                    (said, value, state, text, reading_id, self._cell),
+                ).rowcount
+            except sqlite3.Error as error:
+                raise cannot_write(self.path, error) from error
+        found = self.row(reading_id)
+        if not changed:
+            is_answered = found.reading.answered is not None
+            what = "has an answer already" if is_answered else "is sure, so there is no question about it"
+            raise NotPossibleNow(
+                f"reading {reading_id} {what}", hint="GET /v1/review lists what waits", state="settled"
+            )
+        return found
+
+    def row(self, reading_id: int) -> Row:
+        """Return a reading of the database by its number.
+
+        Raises:
+            NoSuchTask: there is none.
+        """
+        found = self.reader().page(self.ask(), after=reading_id - 1, limit=1)
+        if not found or found[0].id != reading_id:
+            raise NoSuchTask(f"there is no reading {reading_id} of this cell", hint="GET /v1/review lists what waits")
+        return found[0]
 
     def told(self) -> dict[str, str]:
         """Return what each object was last told to be, from its newest reading."""

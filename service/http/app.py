@@ -29,6 +29,7 @@ from service.http import (
     mission_files,
     missions,
     photographs,
+    review,
     rounds,
     session,
     stream,
@@ -129,6 +130,7 @@ def _routers(service: Service) -> tuple[APIRouter, ...]:
         history.router,
         alarms.router,
         rounds.router,
+        review.router,
         session.router,
         health.router,
         stream.router,
@@ -181,6 +183,7 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         TeachRequest,
         *alarms.BODIES,
         *rounds.BODIES,
+        *review.BODIES,
         Problem,
     ]
     _, extra = models_json_schema(

@@ -58,6 +58,14 @@ class HistoryReading(BaseModel):
     phase: str
     told: str | None
     crop_url: str | None
+    sure: Annotated[bool, Field(description="it was given, is above the cell's sure line, and nothing contradicts it")]
+    doubt: Annotated[str, Field(description="why a person should look at it; empty for a sure one")]
+    answered: Annotated[
+        str | None, Field(description="JSON: what a person has said about it: by, verdict, reason, at_s")
+    ]
+    final_value: Annotated[float | None, Field(description="what it shows by that answer; so are the next two")]
+    final_state: str | None
+    final_text: str | None
 
 
 class BucketView(BaseModel):
@@ -96,7 +104,9 @@ class HistoryOverview(BaseModel):
 async def history_overview(state: State) -> HistoryOverview:
     history, cell = state.service.plant.history, state.service.cell.name
     rows = await state.in_thread(lambda: history.reader().newest(cell))
-    return HistoryOverview(newest=[_view(row) for row in rows], set_aside=[path.name for path in history.set_aside])
+    return HistoryOverview(
+        newest=[reading_view(row) for row in rows], set_aside=[path.name for path in history.set_aside]
+    )
 
 
 @router.get(
@@ -150,7 +160,7 @@ async def show_history(
     rows = await state.in_thread(functools.partial(reader.page, question, after=after, limit=limit))
     return HistoryPage(
         object=object,
-        readings=[_view(row) for row in rows],
+        readings=[reading_view(row) for row in rows],
         next_after=rows[-1].id if len(rows) == limit else None,
     )
 
@@ -177,11 +187,12 @@ def _question(state: AppState, name: str | None, since_s: float | None, until_s:
     return state.service.plant.history.ask(object=name, since_s=since_s, until_s=until_s)
 
 
-def _view(row: Row) -> HistoryReading:
+def reading_view(row: Row) -> HistoryReading:
+    """Return a stored reading as the API shows it."""
     plain = asdict(row.reading)
     crop = plain.pop("crop")
     url = None if crop is None else f"/v1/history/{row.reading.object}/crops/{crop}"
-    return HistoryReading(id=row.id, crop_url=url, **plain)
+    return HistoryReading(id=row.id, crop_url=url, sure=row.reading.is_sure, **plain)
 
 
 def _csv(first: Row | None, lines: Iterator[Row]) -> Iterator[str]:

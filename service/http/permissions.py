@@ -70,6 +70,7 @@ TABLE: dict[str, Row] = {
     "GET /v1/history/{object}": OBSERVER,
     "GET /v1/history/{object}/crops/{crop}": OBSERVER,
     "GET /v1/alarms": OBSERVER,
+    "GET /v1/review": OBSERVER,
     "GET /v1/rounds": OBSERVER,
     "GET /v1/rounds/{round}/runs": OBSERVER,
     "GET /v1/images": OBSERVER,
@@ -94,6 +95,7 @@ TABLE: dict[str, Row] = {
     "POST /v1/alarms/{alarm}/unshelve": OPERATOR,
     "POST /v1/alarms/{alarm}/out-of-service": MAINTAINER,
     "POST /v1/alarms/{alarm}/in-service": MAINTAINER,
+    "POST /v1/review/{reading}": OPERATOR,
     "PUT /v1/rounds/{round}": MAINTAINER,  # about later; a round that is due waits while somebody holds the lease
     "DELETE /v1/rounds/{round}": MAINTAINER,
     "POST /v1/knowledge/outline": OPERATOR,

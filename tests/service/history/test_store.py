@@ -150,7 +150,7 @@ def test_a_history_of_a_newer_version_is_refused_and_not_changed(tmp_path: Path)
     history.add([reading(0)])
     history.close()
     with sqlite3.connect(history.path) as db:
-        db.execute("PRAGMA user_version=2")
+        db.execute("PRAGMA user_version=3")
     db.close()
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
     with pytest.raises(HistoryError, match="newer panelwright") as caught:

@@ -39,6 +39,7 @@ PLACE = {
     "{mission}": "none",
     "{group}": "kinds",
     "{round}": "none",
+    "{reading}": "1",
 }
 
 
@@ -113,6 +114,7 @@ def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
         "DELETE /v1/session",
         "POST /v1/knowledge/outline",  # writes nothing
         "POST /v1/read-photograph",
+        "POST /v1/review/{reading}",  # about the past
         "PUT /v1/rounds/{round}",  # about later: a round waits while somebody holds the lease
         "DELETE /v1/rounds/{round}",
         *(f"POST /v1/alarms/{{alarm}}/{deed}" for deed in ALARM_DEEDS),  # for those who watch, whoever moves the arm

@@ -1,0 +1,1 @@
+"""Review: readings that are not sure wait for a person, whose answer corrects the history."""

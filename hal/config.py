@@ -240,6 +240,16 @@ class Cell(Strict):
         """
         return _locate(self.file.cell.panel, self.path, "cell.panel")
 
+    @property
+    def certificate_path(self) -> Path | None:
+        """Path of the certificate of readings; None if the cell file names none.
+
+        Raises:
+            ConfigError: the file does not exist.
+        """
+        name = self.file.review.certificate
+        return None if name is None else _locate(name, self.path, "review.certificate")
+
     def calibration_path(self, name: str) -> Path:
         """Return the path of the calibration record called `name`.
 

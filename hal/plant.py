@@ -33,6 +33,12 @@ class ReviewSection(Strict):
     sure_at: Annotated[
         float, Field(ge=0.5, le=1.0, description="least confidence of a reading that needs no person")
     ] = 0.8
+    audit_share: Annotated[
+        float, Field(ge=0.0, le=1.0, description="share of the sure readings that a person is asked about all the same")
+    ] = 0.0
+    certificate: Annotated[
+        str | None, Field(description="file that `panelwright certify` has written, in the cell file's folder or above")
+    ] = None
 
 
 class RoundSection(Strict):

@@ -45,6 +45,7 @@ def _app() -> Callable[[], None]:
 
     from service.commands import alarms, calibrate, devices, init, keys, missions, review, rounds, serve, tasks
     from service.commands.backup import backup, restore
+    from service.commands.certify import certify
     from service.commands.chaos import chaos
     from service.commands.check import check
     from service.commands.demo import demo
@@ -72,7 +73,7 @@ def _app() -> Callable[[], None]:
     app.callback()(root)
     app.add_typer(init.app)  # without a name of its own, so it is one command
     app.add_typer(serve.app)  # as `init`
-    plain: tuple[Callable[..., None], ...] = (demo, record, replay, sweep, chaos, foxglove, doctor, check)
+    plain: tuple[Callable[..., None], ...] = (demo, record, replay, sweep, certify, chaos, foxglove, doctor, check)
     for command in plain:
         app.command()(command)
     app.add_typer(devices.app, name="devices")

@@ -11,6 +11,7 @@ from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.plant import RoundSection
 from service.alarms.desk import AlarmDesk
+from service.certificate.record import Certificate
 from service.history.observer import Observations
 from service.history.reading import StoredReading
 from service.history.store import History
@@ -45,8 +46,13 @@ class Plant:
         self.history = self._open_history(state_dir / "history", note)
         self.alarms = self._open_alarms(state_dir / "alarms.json", journal, commit)
         self.review = ReviewDesk(self.history, cell.panel, cell=cell.name, commit=commit)
-        doubts = Doubts(cell.panel, sure_at=cell.file.review.sure_at, earlier=self._newest())
-        self.observations = Observations(history=self.history, listeners=[self.alarms.take], doubt_of=doubts.of)
+        asked = cell.file.review
+        newest = [row.reading for row in self.history.reader().newest(cell.name)]
+        doubts = Doubts(cell.panel, sure_at=asked.sure_at, audit_share=asked.audit_share, earlier=newest)
+        self._certificate = Certificate(cell.certificate_path, panel=cell.panel.name, sure_at=asked.sure_at)
+        self.observations = Observations(
+            history=self.history, listeners=[self.alarms.take], doubt_of=doubts.of, certify=self._certify
+        )
         self._is_closing = threading.Event()
         self.check_rounds(cell.file.rounds, source=str(cell.path))
         self._book = RoundBook(state_dir / "rounds" / f"{cell.name}.sqlite")
@@ -92,8 +98,8 @@ class Plant:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise ConfigError(f"{source}: {faults[0]}{more}", hint="correct the rounds", faults=faults)
 
-    def _newest(self) -> list[StoredReading]:
-        return [row.reading for row in self.history.reader().newest(self._cell.name)]
+    def _certify(self, reading: StoredReading, crop: bytes | None) -> str:
+        return self._certificate.of(reading.kind, crop, is_sure=reading.is_sure)
 
     def _is_active(self, alarm: str) -> bool:
         return self.alarms.get(alarm).is_active

@@ -21,15 +21,20 @@ CREATE TABLE IF NOT EXISTS readings (
     state TEXT, text TEXT, confidence REAL NOT NULL, guess TEXT,
     verb TEXT NOT NULL, task TEXT NOT NULL, mission TEXT NOT NULL, asked_by TEXT NOT NULL, phase TEXT NOT NULL,
     told TEXT, crop TEXT,
-    doubt TEXT NOT NULL DEFAULT '', answered TEXT, final_value REAL, final_state TEXT, final_text TEXT
+    doubt TEXT NOT NULL DEFAULT '', certificate TEXT, answered TEXT, final_value REAL, final_state TEXT, final_text TEXT
 );
 CREATE INDEX IF NOT EXISTS readings_of_object ON readings (cell, object, utc_s);
 CREATE INDEX IF NOT EXISTS readings_in_order ON readings (cell, object, id);
 CREATE INDEX IF NOT EXISTS readings_in_doubt ON readings (cell, id) WHERE doubt != '' AND answered IS NULL;
 """
 FROM_VERSION_1 = (
-    "doubt TEXT NOT NULL DEFAULT ''", "answered TEXT", "final_value REAL", "final_state TEXT", "final_text TEXT",
-)  # fmt: skip
+    "doubt TEXT NOT NULL DEFAULT ''",
+    "certificate TEXT",
+    "answered TEXT",
+    "final_value REAL",
+    "final_state TEXT",
+    "final_text TEXT",
+)
 
 
 def open_history(path: Path) -> tuple[sqlite3.Connection, Path | None]:
@@ -86,11 +91,10 @@ def _opened(path: Path) -> sqlite3.Connection:
         db.execute("PRAGMA journal_mode=WAL")
         db.execute("PRAGMA synchronous=FULL")  # NORMAL may lose the newest readings in a power failure
         db.execute("PRAGMA journal_size_limit=4000000")
-        if db.execute("PRAGMA user_version").fetchone()[0] == 1:
-            known = {row[1] for row in db.execute("PRAGMA table_info(readings)")}
-            for column in FROM_VERSION_1:
-                if column.partition(" ")[0] not in known:
-                    db.execute(f"ALTER TABLE readings ADD COLUMN {column}")
+        known = {row[1] for row in db.execute("PRAGMA table_info(readings)")}
+        for column in FROM_VERSION_1:
+            if known and column.partition(" ")[0] not in known:
+                db.execute(f"ALTER TABLE readings ADD COLUMN {column}")
         db.executescript(SCHEMA)
         db.execute(f"PRAGMA user_version={VERSION}")
     except BaseException:

@@ -56,12 +56,14 @@ class Observations:
     Attributes:
         listeners: called with readings after they were stored, for example to raise alarms.
         doubt_of: returns why a person should look at a reading; empty for one that is sure.
+        certify: returns what judged cases say about a reading with this picture, as JSON; None: nothing is said.
         targets: what each object was last told to be.
     """
 
     history: History
     listeners: list[Callable[[Sequence[StoredReading]], None]] = field(default_factory=list)
     doubt_of: Callable[[StoredReading], str] = lambda _reading: ""
+    certify: Callable[[StoredReading, bytes | None], str | None] = lambda _reading, _crop: None
     targets: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -101,6 +103,7 @@ class TaskObserver:
             for reading in readings
         ]
         stored = [replace(one, doubt=self._kept.doubt_of(one)) for one in stored]
+        stored = [replace(one, certificate=self._kept.certify(one, crops.get(one.object))) for one in stored]
         self._kept.history.add(stored)
         for listen in self._kept.listeners:
             listen(stored)

@@ -23,8 +23,8 @@ PART = re.compile(r"readings-(\d{12})-(\d{12})\.parquet")
 NUMBERS = ("utc_s", "cell_s", "value", "sigma", "confidence", "final_value")
 # Columns that parts of version 1 do not have.
 NEWER = (
-    "SELECT '' AS doubt, NULL::VARCHAR AS answered, NULL::DOUBLE AS final_value, NULL::VARCHAR AS final_state, "
-    "NULL::VARCHAR AS final_text LIMIT 0"
+    "SELECT '' AS doubt, NULL::VARCHAR AS certificate, NULL::VARCHAR AS answered, NULL::DOUBLE AS final_value, "
+    "NULL::VARCHAR AS final_state, NULL::VARCHAR AS final_text LIMIT 0"
 )
 
 

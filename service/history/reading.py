@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from perception.vision import ObjectReading
 
 VALID, INVALID = "valid", "invalid"
+AUDIT = "a sure one, drawn for an audit"
 ABSENT = "it is not where the panel file says"
 
 
@@ -31,7 +32,8 @@ class StoredReading:
         phase: the part of the work at which it was taken, such as `before the actions`.
         told: what the object was last told to be; None if it never was.
         crop: SHA-256 of the picture of the object; None if there is none.
-        doubt: why a person should look at it, as a sentence; empty for a reading that is sure.
+        doubt: why a person should look at it, as a sentence; empty for a sure one that was not drawn for an audit.
+        certificate: what judged cases say about it, as JSON; None if nobody asked for that.
         answered: what a person has said about it, as JSON; None as long as nobody has.
         final_value, final_state, final_text: what it shows by that answer; all None if that could not be told.
     """
@@ -57,6 +59,7 @@ class StoredReading:
     told: str | None = None
     crop: str | None = None
     doubt: str = ""
+    certificate: str | None = None
     answered: str | None = None
     final_value: float | None = None
     final_state: str | None = None
@@ -70,7 +73,7 @@ class StoredReading:
     @property
     def is_sure(self) -> bool:
         """Whether it was given, and nothing speaks against it."""
-        return self.is_valid and not self.doubt
+        return self.is_valid and self.doubt in ("", AUDIT)
 
 
 COLUMNS = tuple(field.name for field in fields(StoredReading))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import random
+from collections.abc import Callable, Iterable
 
 from hal.panel import Panel
-from service.history.reading import StoredReading
+from service.history.reading import AUDIT, StoredReading
 
 COUNTER = "counter"
 SIGMAS = 1.96  # of the 95 % interval
@@ -18,12 +19,22 @@ class Doubts:
 
     Args:
         sure_at: least confidence of a reading that is sure.
+        audit_share: share of the sure readings that are drawn for an audit.
         earlier: the newest readings, for the start.
+        draw: returns a number from 0 to 1 for each sure reading.
     """
 
-    def __init__(self, panel: Panel, *, sure_at: float, earlier: Iterable[StoredReading] = ()) -> None:
+    def __init__(
+        self,
+        panel: Panel,
+        *,
+        sure_at: float,
+        audit_share: float = 0.0,
+        earlier: Iterable[StoredReading] = (),
+        draw: Callable[[], float] = random.random,
+    ) -> None:
         self._rates = {one.name: one.limits.rate_per_s for one in panel.objects if one.limits is not None}
-        self._sure_at = sure_at
+        self._sure_at, self._audit_share, self._draw = sure_at, audit_share, draw
         self._last = {reading.object: reading for reading in earlier if reading.is_valid}
 
     def of(self, reading: StoredReading) -> str:
@@ -33,7 +44,8 @@ class Doubts:
         last, self._last[reading.object] = self._last.get(reading.object), reading
         if reading.confidence < self._sure_at:
             return f"its confidence is {reading.confidence:.2f}, below the sure line of {self._sure_at:g}"
-        return "" if last is None else self._contradiction(reading, last)
+        told = "" if last is None else self._contradiction(reading, last)
+        return told or (AUDIT if self._draw() < self._audit_share else "")
 
     def _contradiction(self, reading: StoredReading, last: StoredReading) -> str:
         if reading.value is None or last.value is None:

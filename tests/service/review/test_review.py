@@ -116,7 +116,7 @@ def test_a_history_of_the_first_version_is_taken_over_with_its_parts(tmp_path: P
     history = history_in(tmp_path)
     history.add([reading(0, 1.0), reading(1, 2.0)])
     history.close()
-    newer = COLUMNS[-5:]
+    newer = COLUMNS[-6:]
     with sqlite3.connect(tmp_path / "history.sqlite") as db:
         db.execute("DROP INDEX readings_in_doubt")
         for column in newer:

@@ -1,0 +1,1 @@
+"""Certificates of readings: what judged cases say about how many sure readings are wrong, and where that holds."""

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from hal.calibration import CalibrationRecord, Vector3, load_calibration
 from hal.devices import DeviceKind
 from hal.errors import ConfigError
+from hal.outlets import OutletsSection
 from hal.panel import Panel, load_panel
 from hal.plant import HistorySection, ReviewSection, RoundSection
 from hal.simulated_events import EventSection
@@ -192,6 +193,7 @@ class CellFile(Strict):
     history: HistorySection = HistorySection()
     review: ReviewSection = ReviewSection()
     rounds: Annotated[tuple[RoundSection, ...], Field(max_length=100)] = ()
+    outlets: OutletsSection = OutletsSection()
     emulators: dict[Name, EmulatorSection] = {}
 
     @model_validator(mode="after")

@@ -44,14 +44,19 @@ class Plant:
     def __init__(self, cell: Cell, state_dir: Path, *, journal: Journal, note: Record, commit: Record) -> None:
         self._cell = cell
         self.history = self._open_history(state_dir / "history", note)
-        self.alarms = self._open_alarms(state_dir / "alarms.json", journal, commit)
+        self._journal, self._commit = journal, commit
+        self.changes = 0  # rises with each reading and each change of an alarm
+        self.alarms = self._open_alarms(state_dir / "alarms.json")
         self.review = ReviewDesk(self.history, cell.panel, cell=cell.name, commit=commit)
         asked = cell.file.review
         newest = [row.reading for row in self.history.reader().newest(cell.name)]
         doubts = Doubts(cell.panel, sure_at=asked.sure_at, audit_share=asked.audit_share, earlier=newest)
         self._certificate = Certificate(cell.certificate_path, panel=cell.panel.name, sure_at=asked.sure_at)
         self.observations = Observations(
-            history=self.history, listeners=[self.alarms.take], doubt_of=doubts.of, certify=self._certify
+            history=self.history,
+            listeners=[self.alarms.take, self._note_change],
+            doubt_of=doubts.of,
+            certify=self._certify,
         )
         self._is_closing = threading.Event()
         self.check_rounds(cell.file.rounds, source=str(cell.path))
@@ -98,6 +103,21 @@ class Plant:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise ConfigError(f"{source}: {faults[0]}{more}", hint="correct the rounds", faults=faults)
 
+    def alarm_changes(self, after: int) -> list[dict[str, Any]]:
+        """Return the changes of alarms with a greater number, oldest first; at most the newest thousand."""
+        wanted = (data for data in self._recorded_alarms() if data.get("number", 0) > after)
+        return [{"key_name": None, **data, "id": f"{data['object']}.{data['kind']}"} for data in wanted]
+
+    def _recorded_alarms(self) -> list[dict[str, Any]]:
+        return [record.data for record in self._journal.records(kinds=("alarm",), limit=RESTORED_ALARMS)]
+
+    def _commit_alarm(self, kind: str, data: dict[str, Any]) -> None:
+        self._commit(kind, data)
+        self._note_change()
+
+    def _note_change(self, _readings: Sequence[StoredReading] = ()) -> None:
+        self.changes += 1
+
     def _certify(self, reading: StoredReading, crop: bytes | None) -> str:
         return self._certificate.of(reading.kind, crop, is_sure=reading.is_sure)
 
@@ -116,12 +136,12 @@ class Plant:
             note("history-set-aside", {"file": str(history.set_aside_now)})
         return history
 
-    def _open_alarms(self, path: Path, journal: Journal, commit: Record) -> AlarmDesk:
+    def _open_alarms(self, path: Path) -> AlarmDesk:
         reader, names = self.history.reader(), [one.name for one in self._cell.panel.objects]
         return AlarmDesk(
             self._cell.panel,
             path=path,
-            commit=commit,
-            recorded=[record.data for record in journal.records(kinds=("alarm",), limit=RESTORED_ALARMS)],
+            commit=self._commit_alarm,
+            recorded=self._recorded_alarms(),
             valid_at_s=reader.valid_at_s(self._cell.name, names),
         )

@@ -23,7 +23,8 @@ from service.client import Client
 from service.core import Service, book_of
 from service.exposure import Exposure, unix_socket
 from service.operations import Operation
-from service.processes.console_host import ConsoleHost
+from service.outlets.check import checked_outlets
+from service.processes.client_host import GATEWAY, OUTLETS, OUTLETS_KEY, ClientHost, ConsoleHost
 from service.processes.stop_host import bound_socket
 
 if TYPE_CHECKING:
@@ -126,6 +127,8 @@ class Panelwright:
                 keep=self.service.lease.subs.all_kept,
             )
 
+        self.gateway = self._gateway_host(cell, options)
+
     @property
     def url(self) -> str:
         """Address of the HTTP server."""
@@ -193,6 +196,8 @@ class Panelwright:
         self._is_ending.set()
         if self.console is not None:
             self.console.close()
+        if self.gateway is not None:
+            self.gateway.close()
         if self._server is not None:
             self._server.stop()
         self.service.close()
@@ -243,6 +248,18 @@ class Panelwright:
         if self._wants_warmth:
             threading.Thread(target=self._warm, name="warm", daemon=True).start()
 
+    def _gateway_host(self, cell: Cell, options: Options) -> ClientHost | None:
+        """Return the process of the outlets; None if the cell file asks for none."""
+        if cell.file.outlets.is_empty:
+            return None
+        outlets = checked_outlets(cell.file.outlets, cell.path.parent)
+        cert = self._exposure.tls_cert
+        arguments = ["--service", self.url, "--cell", cell.name]
+        arguments += ["--folder", str((options.runs_dir / ".service" / "outlets").absolute())]
+        arguments += [] if cert is None else ["--ca", str(Path(cert).absolute())]
+        environment = {OUTLETS: outlets.model_dump_json(), OUTLETS_KEY: self.service.keys.for_gateway()}
+        return ClientHost(GATEWAY, arguments, name="gateway", report=self.service.note, environment=environment)
+
     def _start_service(self) -> None:
         try:
             self.service.start()
@@ -256,6 +273,8 @@ class Panelwright:
         self._is_settled.set()
         if self._error is None and self.console is not None:
             self.console.start()  # after the cell, with which it would share the processor
+        if self._error is None and self.gateway is not None:
+            self.gateway.start()
         if self._error is not None and self._server is not None:
             self._server.stop()
 

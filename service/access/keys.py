@@ -29,7 +29,7 @@ from service.errors import KeysUnusable
 FILE = "keys.json"
 MODE = 0o600
 KEY_BYTES = 32
-OWN = "this-program"  # a name that no stored key has
+OWN, GATEWAY = "this-program", "gateway"  # names that no stored key has
 PREFIX = "pw_"  # so that scanners for secrets recognise a key
 PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}")
 Commit = Callable[[str, dict[str, Any]], None]
@@ -87,6 +87,8 @@ class KeyBook:
         self._had_keys = False
         self._own_secret = _new_secret()
         self._own = Key(name=OWN, role=Role.MAINTAINER, sha256=_hash(self._own_secret), added_s=now())
+        self._gateway_secret = _new_secret()
+        self._gateway = Key(name=GATEWAY, role=Role.OBSERVER, sha256=_hash(self._gateway_secret), added_s=now())
 
     def all(self) -> tuple[Key, ...]:
         """Return all keys, also revoked and expired ones.
@@ -122,11 +124,16 @@ class KeyBook:
         """Return the key for this program's own clients, which is kept in memory only and ends with the program."""
         return self._own_secret
 
+    def for_gateway(self) -> str:
+        """Return the key for this program's gateway, which may only look; it is kept in memory only."""
+        return self._gateway_secret
+
     def find(self, secret: str) -> Key | None:
         """Return the active key with this secret, or None."""
         self.all()
         digest = _hash(secret)
-        key = self._own if self._own.sha256 == digest else self._by_hash.get(digest)
+        ours = {one.sha256: one for one in (self._own, self._gateway)}
+        key = ours.get(digest) or self._by_hash.get(digest)
         if key is None or not hmac.compare_digest(key.sha256, digest) or not key.is_active(self._now()):
             return None
         return key
@@ -145,7 +152,7 @@ class KeyBook:
         Raises:
             InvalidRequest: the name is not plain, or an active key has it.
         """
-        if not PLAIN_NAME.fullmatch(name) or name == OWN:
+        if not PLAIN_NAME.fullmatch(name) or name in (OWN, GATEWAY):
             raise InvalidRequest(f"{name[:40]!r} is no name of a key", hint="letters, digits and - _ . @, at most 64")
         secret = _new_secret()
         now_s = self._now()

@@ -70,6 +70,11 @@ class AlarmDesk:
         }
         self._restore(recorded)
 
+    @property
+    def number(self) -> int:
+        """Number of the newest change."""
+        return self._number
+
     def all(self) -> list[Alarm]:
         """Return all alarms, also normal ones, in the order of the panel file."""
         with self._lock:

@@ -130,6 +130,12 @@ class Reader:
             found += read_parts(older, sums, f"{where} GROUP BY 1, 2", values)
         return _merged(found, since_s, width_s)
 
+    def newest_id(self) -> int:
+        """Return the number of the newest reading of the file; 0 before the first."""
+        with self._open() as db:
+            row = db.execute("SELECT seq FROM sqlite_sequence WHERE name = 'readings'").fetchone()
+        return 0 if row is None else int(row[0])
+
     def newest(self, cell: str) -> list[Row]:
         """Return the newest reading of each object of the database."""
         chosen = "SELECT MAX(id) FROM readings WHERE cell = ? GROUP BY object"

@@ -70,6 +70,7 @@ TABLE: dict[str, Row] = {
     "GET /v1/history/{object}": OBSERVER,
     "GET /v1/history/{object}/crops/{crop}": OBSERVER,
     "GET /v1/alarms": OBSERVER,
+    "GET /v1/feed": OBSERVER,
     "GET /v1/review": OBSERVER,
     "GET /v1/rounds": OBSERVER,
     "GET /v1/rounds/{round}/runs": OBSERVER,

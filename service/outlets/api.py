@@ -1,0 +1,77 @@
+"""The HTTP API as the source of outlets."""
+
+from __future__ import annotations
+
+import json
+import ssl
+from pathlib import Path
+from typing import Any
+
+import httpx2
+
+from hal.errors import DeviceUnavailable
+from service.client import ApiError
+from service.outlets.source import CellState, Changes, Cursor
+
+TIMEOUT_S = 10.0
+
+
+class ApiSource:
+    """The source of outlets at a service; see `service.outlets.source.Source`.
+
+    Args:
+        url: its address.
+        key: an observer's key, for a service that has keys.
+        ca: certificate to trust, for an https address.
+        transport: carries the requests; None for the network.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        key: str | None = None,
+        ca: Path | None = None,
+        transport: httpx2.AsyncBaseTransport | None = None,
+    ) -> None:
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        verify: ssl.SSLContext | bool = True if ca is None else ssl.create_default_context(cafile=ca)
+        self._http = httpx2.AsyncClient(
+            base_url=url, headers=headers, timeout=TIMEOUT_S, trust_env=False, verify=verify, transport=transport
+        )
+
+    async def changes(self, cursor: Cursor, *, wait_s: float) -> Changes:
+        """Return what came after a cursor."""
+        given = {"readings_after": cursor.reading, "alarms_after": cursor.alarm}
+        asked = {key: value for key, value in given.items() if value is not None} | {"wait_s": wait_s}
+        found = await self._get("/v1/feed", asked, timeout_s=wait_s + TIMEOUT_S)
+        return Changes(
+            readings=tuple(found["readings"]),
+            alarms=tuple(found["alarms"]),
+            cursor=Cursor(reading=found["readings_after"], alarm=found["alarms_after"]),
+        )
+
+    async def state(self) -> CellState:
+        """Return the state of the cell."""
+        history, alarms = await self._get("/v1/history"), await self._get("/v1/alarms", {"all": "true"})
+        devices, ready = await self._get("/v1/devices"), await self._get("/readyz")
+        return CellState(
+            readings={one["object"]: one for one in history["newest"]},
+            alarms={one["id"]: one for one in alarms["alarms"]},
+            devices={one["name"]: one for one in devices["devices"]},
+            is_ready=bool(ready.get("is_ready", False)),
+        )
+
+    async def close(self) -> None:
+        """Close its connections."""
+        await self._http.aclose()
+
+    async def _get(self, path: str, asked: dict[str, Any] | None = None, *, timeout_s: float = TIMEOUT_S) -> Any:
+        try:
+            answer = await self._http.get(path, params=asked, timeout=timeout_s)
+            found = json.loads(answer.content)
+        except (httpx2.RequestError, ValueError) as error:
+            raise DeviceUnavailable(f"the service does not answer: {error}", hint="see its log") from error
+        if answer.status_code >= httpx2.codes.BAD_REQUEST and path != "/readyz":
+            raise ApiError(found if isinstance(found, dict) else {})
+        return found

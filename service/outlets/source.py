@@ -1,0 +1,93 @@
+"""What outlets are told: the changes of a cell in order, from a place that each remembers, and its state now."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from hal.atomic_write import write_atomically
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cursor:
+    """The newest reading and the newest change of an alarm that were told; None before anything was."""
+
+    reading: int | None = None
+    alarm: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Changes:
+    """What has happened after a cursor, as the HTTP API shows it, and the cursor after it."""
+
+    readings: tuple[Mapping[str, Any], ...] = ()
+    alarms: tuple[Mapping[str, Any], ...] = ()
+    cursor: Cursor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellState:
+    """The state of a cell: the newest reading of each object, all alarms, and the devices, as the HTTP API shows them."""
+
+    readings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    alarms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    devices: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    is_ready: bool = False
+
+
+class Source(Protocol):
+    """A cell as outlets see it."""
+
+    async def changes(self, cursor: Cursor, *, wait_s: float) -> Changes:
+        """Return what came after a cursor, oldest first; waits for something at most `wait_s`. Without a cursor: nothing yet.
+
+        Raises:
+            CellError: the service does not answer.
+        """
+        ...
+
+    async def state(self) -> CellState:
+        """Return the state now; raises as `changes`."""
+        ...
+
+
+class CursorFile:
+    """A cursor that outlives the gateway."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def load(self) -> Cursor:
+        """Return the saved cursor; without a readable file an empty one."""
+        try:
+            saved = json.loads(self._path.read_text(encoding="utf-8"))
+            return Cursor(reading=saved["reading"], alarm=saved["alarm"])
+        except (OSError, ValueError, LookupError, TypeError):
+            return Cursor()
+
+    def save(self, cursor: Cursor) -> None:
+        """Save a cursor, after all before it was delivered."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self._path, json.dumps({"reading": cursor.reading, "alarm": cursor.alarm}))
+
+
+def told(reading: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a reading as outlets tell it: what is shown, how good it is, and its number, by which a repeat is recognised."""
+    keys = (
+        "id",
+        "object",
+        "kind",
+        "utc_s",
+        "quality",
+        "cause",
+        "value",
+        "unit",
+        "sigma",
+        "state",
+        "text",
+        "confidence",
+    )
+    return {key: reading[key] for key in (*keys, "sure", "task")}

@@ -1,0 +1,221 @@
+"""Tests of webhook, Prometheus, the feed of the service, the check of the cell file, and the gateway's process."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+
+from hal.config import load_cell
+from hal.errors import ConfigError
+from hal.outlets import MqttSection, OutletsSection, PrometheusSection, WebhookSection
+from service.access.keys import Role
+from service.outlets.check import checked_outlets
+from service.outlets.process import outlets_of
+from service.outlets.prometheus import PrometheusOutlet
+from service.outlets.source import Cursor, CursorFile
+from service.outlets.webhook import WebhookOutlet, signature_of
+from service.serve import Options, Panelwright
+from tests.service.conftest import WriteCell
+from tests.service.history.test_store import reading
+from tests.service.outlets.fakes import FakeSource, no_pause
+from tests.service.verbs import OPERATIONS
+from tests.service.waiting import eventually
+
+NOW_S = 1_790_000_000.0
+
+
+class Receiver:
+    """The far side of the webhook: it answers with the statuses that it was given, then with 204."""
+
+    def __init__(self, *statuses: int) -> None:
+        self.statuses, self.got = list(statuses), list[httpx2.Request]()
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        self.got.append(request)
+        status = self.statuses.pop(0) if self.statuses else 204
+        if status == 0:
+            raise httpx2.ConnectError("connection refused", request=request)
+        return httpx2.Response(status)
+
+
+def delivered(folder: Path, source: FakeSource, receiver: Receiver, **given: Any) -> list[dict[str, Any]]:
+    """Run the webhook until everything is delivered or dead; returns the dead letters."""
+    section = WebhookSection(url="http://plant.example/hook", secret_file="unused", **given)  # noqa: S106 - a path
+    cursor, dead = CursorFile(folder / "webhook.json"), folder / "dead.jsonl"
+    cursor.save(Cursor(reading=0, alarm=0))
+    outlet = WebhookOutlet(
+        section,
+        cell="bench",
+        source=source,
+        cursor=cursor,
+        secret="s3cret",  # noqa: S106 - of a test
+        dead_letters=dead,
+        sleep=no_pause,
+        now_s=lambda: NOW_S,
+        transport=httpx2.MockTransport(receiver),
+    )
+
+    async def story() -> None:
+        task = asyncio.ensure_future(outlet.run())
+        async with asyncio.timeout(30.0):
+            while cursor.load() != Cursor(reading=len(source.readings), alarm=len(source.alarms)):  # noqa: ASYNC110 - a file
+                await asyncio.sleep(0.005)
+        task.cancel()
+
+    asyncio.run(story())
+    return [json.loads(line) for line in dead.read_text().splitlines()] if dead.exists() else []
+
+
+def test_a_change_of_an_alarm_is_sent_signed(tmp_path: Path) -> None:
+    source, receiver = FakeSource(), Receiver()
+    source.alarms_change()
+    source.reads(1.0)
+    assert delivered(tmp_path, source, receiver) == []
+    (request,) = receiver.got
+    body, headers = request.content.decode(), request.headers
+    assert json.loads(body)["alarm"]["id"] == "pressure.high"
+    assert (headers["x-panelwright-id"], headers["x-panelwright-timestamp"]) == ("bench-alarm-1", f"{NOW_S:.0f}")
+    assert headers["x-panelwright-signature"] == signature_of(b"s3cret", f"{NOW_S:.0f}", body)
+    assert signature_of(b"other", f"{NOW_S:.0f}", body) != headers["x-panelwright-signature"]
+
+
+def test_what_fails_is_tried_again_in_order_with_the_same_number(tmp_path: Path) -> None:
+    source, receiver = FakeSource(), Receiver(0, 503, 429)
+    source.alarms_change()
+    source.alarms_change(state="acknowledged")
+    assert delivered(tmp_path, source, receiver) == []
+    assert [request.headers["x-panelwright-id"][-1] for request in receiver.got] == ["1", "1", "1", "1", "2"]
+
+
+@pytest.mark.parametrize(("statuses", "tries", "why"), [((503,) * 3, 3, "status 503"), ((400,), 1, "status 400")])
+def test_what_cannot_be_delivered_is_kept_and_holds_up_nothing(
+    tmp_path: Path, statuses: tuple[int, ...], tries: int, why: str
+) -> None:
+    source, receiver = FakeSource(), Receiver(*statuses)
+    source.reads(1.0)
+    source.reads(2.0)
+    (dead,) = delivered(tmp_path, source, receiver, tries=3, events=("readings",))
+    assert (dead["id"], dead["why"], dead["reading"]["value"]) == ("bench-reading-1", why, 1.0)
+    assert len(receiver.got) == tries + 1
+
+
+def scraped(outlet: PrometheusOutlet) -> dict[tuple[str, str], float]:
+    registry = CollectorRegistry()
+    registry.register(outlet)
+    families = text_string_to_metric_families(generate_latest(registry).decode())
+    return {
+        (sample.name, "/".join(value for name, value in sample.labels.items() if name != "cell")): sample.value
+        for family in families
+        for sample in family.samples
+    }
+
+
+def test_prometheus_gets_values_states_and_alarms_and_nothing_old(tmp_path: Path) -> None:
+    source = FakeSource()
+    source.reads(4.5)
+    source.reads(None, object="flow")
+    source.alarms_change()
+    outlet = PrometheusOutlet(PrometheusSection(), cell="bench", source=source)
+    asyncio.run(outlet.refresh())
+    found = scraped(outlet)
+    assert found["panelwright_reading", "pressure/bar"] == 4.5
+    assert found["panelwright_reading_valid", "flow"] == 0.0
+    assert ("panelwright_reading", "flow/bar") not in found, "a refused reading has no value"
+    assert found["panelwright_alarm", "pressure.high/unacknowledged"] == 1.0
+    source.is_silent = True
+    asyncio.run(outlet.refresh())
+    assert scraped(outlet) == {("panelwright_up", ""): 0.0}
+
+
+def test_only_what_the_cell_file_asks_for_is_imported(tmp_path: Path) -> None:
+    code = (
+        "import sys, pathlib; from service.outlets.process import outlets_of; from hal.outlets import *; "
+        "outlets_of(OutletsSection(prometheus=PrometheusSection()), cell='a', source=None, folder=pathlib.Path()); "
+        "print(sorted({'aiomqtt', 'paho', 'scipy', 'fastapi'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+    assert outlets_of(OutletsSection(), cell="a", source=FakeSource(), folder=tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "told"),
+    [(None, 0o600, "cannot be read"), ("", 0o600, "is empty"), ("s", 0o644, "other users may access")],
+)
+def test_a_secret_that_is_missing_or_open_to_others_is_refused(
+    tmp_path: Path, text: str | None, mode: int, told: str
+) -> None:
+    if text is not None:
+        (tmp_path / "secret").write_text(text)
+        (tmp_path / "secret").chmod(mode)
+    section = OutletsSection(webhook=WebhookSection(url="http://a/b", secret_file="secret"))  # noqa: S106 - a path
+    with pytest.raises(ConfigError, match=told):
+        checked_outlets(section, tmp_path)
+
+
+def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.outlets.check.find_spec", lambda _name: None)
+    with pytest.raises(ConfigError, match="aiomqtt") as caught:
+        checked_outlets(OutletsSection(mqtt=MqttSection(host="broker")), tmp_path)
+    assert "panelwright[mqtt]" in caught.value.hint
+
+
+def test_the_feed_tells_what_has_come_since_in_order(served: Panelwright, client: httpx2.Client) -> None:
+    start = client.get("/v1/feed").json()
+    assert (start["readings"], start["alarms"]) == ([], [])
+    plant = served.service.plant
+    plant.history.add([reading(k, float(k)) for k in range(3)])
+    lamp = {"object": "pump_lamp", "kind": "lamp", "unit": ""}
+    plant.alarms.take([reading(0, None, state="off", **lamp)])
+    plant.alarms.take([reading(0, None, state="on", **lamp)])
+    asked = f"/v1/feed?readings_after={start['readings_after']}&alarms_after={start['alarms_after']}"
+    found = client.get(asked).json()
+    assert [one["value"] for one in found["readings"]] == [0.0, 1.0, 2.0]
+    assert [one["state"] for one in found["alarms"]] == ["unacknowledged", "returned-unacknowledged"]
+    rest = client.get(f"/v1/feed?readings_after={found['readings_after']}&alarms_after={found['alarms_after']}").json()
+    assert (rest["readings"], rest["alarms"]) == ([], [])
+    assert (
+        client.get("/v1/feed?readings_after=999999&alarms_after=0").json()["readings_after"] == found["readings_after"]
+    )
+    plant.alarms.acknowledge("pump_lamp.state", by="cleaner")
+
+
+def test_the_gateway_is_a_process_of_its_own_that_is_started_again(write_cell: WriteCell, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    cell = load_cell(write_cell(robot=True, extra=f"[outlets.prometheus]\nport = {port}"))
+    panelwright = Panelwright(cell, Options(port=0, runs_dir=tmp_path / "runs", inline=True), operations=OPERATIONS)
+    book = panelwright.service.keys
+    book.add(
+        "alice", Role.OPERATOR, valid_s=None, commit=panelwright.service.commit
+    )  # so the gateway needs its own key
+
+    def up() -> bool:
+        try:
+            return 'panelwright_up{cell="fake"} 1.0' in httpx2.get(f"http://127.0.0.1:{port}/metrics").text
+        except httpx2.RequestError:
+            return False
+
+    try:
+        panelwright.start()
+        eventually(up)
+        gateway = panelwright.gateway
+        assert gateway is not None and gateway.pid is not None
+        first = gateway.pid
+        os.kill(first, signal.SIGKILL)
+        eventually(lambda: gateway.pid not in (None, first) and up())
+    finally:
+        panelwright.close()

@@ -84,8 +84,8 @@ def test_a_suspended_stop_process_latches_the_stop_and_is_replaced(scene: Scene)
 
 
 def test_resets_that_wait_for_a_suspended_stop_process_delay_no_stop(scene: Scene) -> None:
+    seen = scene.supervisor.stop("test").count
     os.kill(scene.pid("stop"), signal.SIGSTOP)
-    seen = scene.supervisor.latch.state().count
     with ThreadPoolExecutor(5) as pool:
         resets = [pool.submit(scene.supervisor.reset, "test", seen_count=seen) for _ in range(4)]
         stopped = pool.submit(scene.supervisor.stop, "a person").result(4.0)

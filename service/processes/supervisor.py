@@ -331,7 +331,9 @@ class Supervisor:
             return
         why = self._cell_beat.lost(silence_s=SILENCE_S) if child.is_alive() else "has ended"
         if why is None:
-            self._lost_since_s = None
+            if self._lost_since_s is not None:  # it goes on, but the stop stays latched
+                self._lost_since_s = None
+                self._is_ready.set()
             return
         if self._lost_since_s is None:
             self._lost_since_s = now_s

@@ -104,6 +104,15 @@ def test_a_suspended_cell_is_latched_by_name_and_replaced(scene: Scene) -> None:
     assert scene.supervisor.latch.is_set()
 
 
+def test_a_cell_that_goes_on_after_a_moment_is_ready_again_and_stays_stopped(scene: Scene) -> None:
+    pid = scene.pid("cell")
+    os.kill(pid, signal.SIGSTOP)
+    eventually(lambda: scene.is_latched_by("the cell process is suspended"), timeout_s=SOON_S)
+    os.kill(pid, signal.SIGCONT)
+    eventually(lambda: scene.supervisor.is_ready, timeout_s=SOON_S)
+    assert scene.pid("cell") == pid and scene.supervisor.latch.is_set()
+
+
 def test_a_dead_world_ends_its_cell_which_comes_back_with_a_new_one(scene: Scene, tmp_path: Path) -> None:
     world = int(eventually((tmp_path / "world.pid").read_text))
     os.kill(world, signal.SIGKILL)

@@ -16,9 +16,10 @@ import httpx2
 from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry, detail_lines
 
 DEFAULT_URL = "http://127.0.0.1:8460"
-# Commands that address a service, without those that have their own address or their own cell or read files.
+# Commands that address a service; those that name their service or their own cell, or only read files, do not count.
 TALKING = re.compile(
-    r"`panelwright (?!devices (?:record|replay))(?:devices|task|stop|calibrate|learn)\b"
+    r"`panelwright (?:devices(?! (?:record|replay)\b)|task|stop|learn|history|foxglove|alarms|rounds"
+    r"|mission (?:run|resume)|calibrate (?:camera|hand-eye|scanner|tool|list))(?![\w-])"
     r"(?![^`]*--(?:url|cell)\b)[^`]*(?=`)"
 )
 FINAL = ("succeeded", "failed", "cancelled")
@@ -33,6 +34,21 @@ def for_service(text: str, url: str) -> str:
     """
     url = url.rstrip("/")
     return text if url == DEFAULT_URL else TALKING.sub(rf"\g<0> --url {url}", text)
+
+
+def document(data: str | bytes, url: str) -> Any:
+    """Return a JSON document of the service at `url`, with hints whose commands address it; see `for_service`.
+
+    Raises:
+        ValueError: the text is not JSON.
+    """
+
+    def addressed(found: dict[str, Any]) -> dict[str, Any]:
+        if isinstance(hint := found.get("hint"), str):
+            found["hint"] = for_service(hint, url)
+        return found
+
+    return json.loads(data, object_hook=addressed)
 
 
 class ApiError(CellError):
@@ -77,9 +93,13 @@ class Client:
     ca: Path | None = None
     is_lasting: bool = True
 
+    @property
+    def _hint_url(self) -> str:
+        return self.url if self.is_lasting else DEFAULT_URL
+
     def addressed(self, hint: str) -> str:
         """Return a hint whose commands address this service; see `for_service`."""
-        return for_service(hint, self.url) if self.is_lasting else hint
+        return for_service(hint, self._hint_url)
 
     def get(self, path: str) -> Any:
         """Return the JSON answer to a GET request.
@@ -89,11 +109,11 @@ class Client:
             ConfigError: the address is not valid, or another program answers there.
             DeviceUnavailable: nothing answers there.
         """
-        return _json(self.fetch("GET", path))
+        return self._json(self.fetch("GET", path))
 
     def post(self, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> Any:
         """Return the JSON answer to a POST request; errors as for `get`."""
-        return _json(self.fetch("POST", path, body, headers=headers))
+        return self._json(self.fetch("POST", path, body, headers=headers))
 
     def stop(self) -> Any:
         """Latch the software stop through the service or, when that does not answer at once, through its stop process.
@@ -122,7 +142,7 @@ class Client:
 
     def put(self, path: str, body: Any) -> Any:
         """Return the JSON answer to a PUT request; errors as for `get`."""
-        return _json(self.fetch("PUT", path, body))
+        return self._json(self.fetch("PUT", path, body))
 
     def fetch(self, method: str, path: str, body: Any = None, *, headers: dict[str, str] | None = None) -> bytes:
         """Return the raw bytes of an answer; errors as for `get`."""
@@ -143,7 +163,7 @@ class Client:
         with self._stream("GET", path, None, {"Last-Event-ID": str(last), "Accept": "text/event-stream"}) as answer:
             try:
                 for event in httpx2.EventSource(answer):
-                    yield json.loads(event.data)
+                    yield document(event.data, self._hint_url)
             except httpx2.RequestError:
                 return  # the caller checks whether the task has ended, and calls again if not
 
@@ -156,11 +176,27 @@ class Client:
             try:
                 with connection.stream(method, url, json=body, headers={**self._own_headers(), **headers}) as answer:
                     if answer.status_code >= httpx2.codes.BAD_REQUEST:
-                        problem = _problem(answer.read(), answer.status_code)
-                        raise ApiError({**problem, "hint": self.addressed(str(problem.get("hint", SEE_LOG)))})
+                        raise ApiError(self._problem(answer.read(), answer.status_code))
                     yield answer
             except httpx2.RequestError as error:
                 raise self._lost(error) from error
+
+    def _json(self, data: bytes) -> Any:
+        try:
+            return document(data, self._hint_url)
+        except ValueError:
+            raise ConfigError(
+                "another program answers there", hint="`panelwright serve` prints the address of its API"
+            ) from None
+
+    def _problem(self, data: bytes, status: int) -> dict[str, Any]:
+        try:
+            problem = document(data, self._hint_url)
+        except ValueError:
+            problem = None
+        return (
+            problem if isinstance(problem, dict) else {"title": "Problem", "detail": f"the service answered {status}"}
+        )
 
     def _address(self) -> httpx2.URL:
         try:
@@ -199,20 +235,3 @@ def _port_option(url: str) -> str:
     """Return the option with which `serve` listens at `url`; empty for the default."""
     port = httpx2.URL(url if "//" in url else f"http://{url}").port
     return "" if port in (None, httpx2.URL(DEFAULT_URL).port) else f" --port {port}"
-
-
-def _json(data: bytes) -> Any:
-    try:
-        return json.loads(data)
-    except ValueError:
-        raise ConfigError(
-            "another program answers there", hint="`panelwright serve` prints the address of its API"
-        ) from None
-
-
-def _problem(data: bytes, status: int) -> dict[str, Any]:
-    try:
-        problem = json.loads(data)
-    except ValueError:
-        problem = None
-    return problem if isinstance(problem, dict) else {"title": "Problem", "detail": f"the service answered {status}"}

@@ -215,7 +215,7 @@ def watch_devices(
             except CellError as error:  # a service that answered before may come back
                 if looks == 0:
                     raise
-                shown = f"[red]{escape(error.what)}[/]; try: {escape(client.addressed(error.hint))}"
+                shown = f"[red]{escape(error.what)}[/]; try: {escape(error.hint)}"
             if live is None:  # without a terminal, print each table below the one before
                 console.print(shown)
             else:

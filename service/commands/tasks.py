@@ -63,8 +63,7 @@ def follow(client: Client, task_id: str) -> dict[str, Any]:
     task: dict[str, Any] = client.get(f"/v1/tasks/{task_id}")
     console.print(f"task {task_id} [{state_style(task['state'])}]{task['state']}[/]")
     if task["problem"] is not None:
-        hint = client.addressed(task["problem"]["hint"])
-        console.print(f"  {escape(task['problem']['detail'])}\n  try    {escape(hint)}")
+        console.print(f"  {escape(task['problem']['detail'])}\n  try    {escape(task['problem']['hint'])}")
     return task
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import AsyncIterator
 from typing import Any
 
 import httpx2
 
 from hal.errors import DeviceUnavailable
-from service.client import ApiError
+from service.client import ApiError, document
 from service.console.texts import say
 
 TIMEOUT_S = 40.0
@@ -35,11 +34,11 @@ class ServiceClient:
             ApiError: the service answered with a problem.
             DeviceUnavailable: it does not answer.
         """
-        return json.loads(await self.fetch("GET", path, timeout_s=timeout_s))
+        return document(await self.fetch("GET", path, timeout_s=timeout_s), self.url)
 
     async def post(self, path: str, body: Any = None) -> Any:
         """Return the JSON answer to a POST request; errors as for `get`."""
-        return json.loads(await self.fetch("POST", path, body))
+        return document(await self.fetch("POST", path, body), self.url)
 
     async def fetch(self, method: str, path: str, body: Any = None, *, timeout_s: float = TIMEOUT_S) -> bytes:
         """Return the bytes of an answer; errors as for `get`."""
@@ -48,7 +47,7 @@ class ServiceClient:
         except httpx2.RequestError as error:
             raise DeviceUnavailable(say("service.silent"), hint=say("service.silent.hint")) from error
         if answer.status_code >= httpx2.codes.BAD_REQUEST and path != "/readyz":
-            raise ApiError(_problem(answer.content, answer.status_code))
+            raise ApiError(_problem(answer.content, answer.status_code, self.url))
         return answer.content
 
     async def events(self, task_id: str) -> AsyncIterator[dict[str, Any]]:
@@ -57,7 +56,7 @@ class ServiceClient:
         try:
             async with self._http.stream("GET", f"/v1/tasks/{task_id}/events", headers=headers, timeout=None) as answer:
                 async for event in httpx2.EventSource(answer):
-                    yield json.loads(event.data)
+                    yield document(event.data, self.url)
         except httpx2.RequestError:
             return
 
@@ -66,9 +65,9 @@ class ServiceClient:
         await self._http.aclose()
 
 
-def _problem(data: bytes, status: int) -> dict[str, Any]:
+def _problem(data: bytes, status: int, url: str) -> dict[str, Any]:
     try:
-        problem = json.loads(data)
+        problem = document(data, url)
     except ValueError:
         problem = None
     return (

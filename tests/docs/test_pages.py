@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
+from collections.abc import Iterable, Iterator
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from hal.config import load_cell
 from hal.panel import PanelObject, load_panel
 from hal.panel.kinds import KINDS
 from service.cli import _app
+from service.client import for_service
 from tests.docs import commands_page, driver_pages
 from tests.docs.blocks import PAGES, ROOT, page_name
 
@@ -56,17 +58,23 @@ def _written_commands() -> set[str]:
     """Return the command lines of all pages, and those that messages and docstrings of the sources name in backticks."""
     pages = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     lines = re.findall(r"^(?:\.venv/bin/)?panelwright ([a-z][^\n#>|&]*)", pages, flags=re.MULTILINE)
-    texts = [pages]
+    return {" ".join(line.split()) for line in [*lines, *_quoted([pages, *_messages()])]}
+
+
+def _messages() -> Iterator[str]:
+    """Yield the messages and docstrings of the sources that may name a command; a value in one is a space."""
     for room in ("drivers", "hal", "manipulation", "perception", "service", "simbackend"):
         for path in (ROOT / room).rglob("*.py"):
             source = path.read_text(encoding="utf-8")
             for node in ast.walk(ast.parse(source)) if "`panelwright " in source else ():
                 if isinstance(node, ast.JoinedStr):
-                    texts.append("".join(str(v.value) if isinstance(v, ast.Constant) else " " for v in node.values))
+                    yield "".join(str(v.value) if isinstance(v, ast.Constant) else " " for v in node.values)
                 elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                    texts.append(node.value)
-    quoted = (found for text in texts for found in re.findall(r"`(?:\.venv/bin/)?panelwright ([a-z][^`]*)`", text))
-    return {" ".join(line.split()) for line in [*lines, *quoted]}
+                    yield node.value
+
+
+def _quoted(texts: Iterable[str]) -> list[str]:
+    return [found for text in texts for found in re.findall(r"`(?:\.venv/bin/)?panelwright ([a-z][^`]*)`", text)]
 
 
 def _unknown(command: Any, words: list[str]) -> str | None:
@@ -88,6 +96,27 @@ def test_every_command_that_pages_and_messages_name_exists_with_its_options() ->
     assert {"serve", "demo", "doctor"} <= {line.split()[0] for line in commands}
     unknown = {line: _unknown(panelwright, line.split()) for line in commands}
     assert not {line: word for line, word in unknown.items() if word is not None}
+
+
+def _commands(command: Any, words: str = "") -> Iterator[tuple[str, set[str]]]:
+    """Yield each command that can be run, and its options."""
+    if not hasattr(command, "commands") or command.invoke_without_command:
+        yield words, {option for parameter in command.params for option in parameter.opts}
+    for name, part in getattr(command, "commands", {}).items():
+        yield from _commands(part, f"{words} {name}".lstrip())
+
+
+def test_every_command_in_a_hint_gets_the_address_of_its_service_if_it_takes_one() -> None:
+    """A hint without `--url` would send people to another service, and one command would refuse the option."""
+    takes_url = {words: "--url" in options for words, options in _commands(typer.main.get_command(_app()))}
+    hinted = {" ".join(line.split()) for line in _quoted(_messages())}
+    for line in [*takes_url, *hinted]:
+        known = [words for words in takes_url if f"{line} ".startswith(f"{words} ")]
+        if not known:
+            continue  # such as `panelwright task …`, which stands for several commands
+        expected = takes_url[max(known, key=len)] and not re.search("--(url|cell)", line)
+        given = for_service(f"`panelwright {line}`", "http://127.0.0.1:9000")
+        assert ("--url http://127.0.0.1:9000`" in given) == expected, line
 
 
 def test_the_page_of_commands_is_what_the_commands_say() -> None:

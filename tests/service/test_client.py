@@ -178,6 +178,8 @@ AT = "http://127.0.0.1:9000"
         ("run `panelwright devices` and look", f"run `panelwright devices --url {AT}` and look"),
         ("then `panelwright stop --reset`, later", f"then `panelwright stop --reset --url {AT}`, later"),
         ("`panelwright calibrate camera --device c`", f"`panelwright calibrate camera --device c --url {AT}`"),
+        ("`panelwright calibrate tip` and `panelwright mission check m`", None),
+        ("`panelwright mission run m`", f"`panelwright mission run m --url {AT}`"),
         ("`panelwright task cancel t1 --url http://b`", "`panelwright task cancel t1 --url http://b`"),
         ("`panelwright devices read x --cell c.toml`", "`panelwright devices read x --cell c.toml`"),
         ("`panelwright devices record x out`; `panelwright doctor`", None),
@@ -193,12 +195,15 @@ def test_a_command_in_a_hint_names_the_service_at_hand(hint: str, addressed: str
     assert Client(url=AT, is_lasting=False).addressed(hint) == hint
 
 
+PROBLEM = {"detail": "silent", "hint": "run `panelwright devices`"}
+
+
 class Refusing(BaseHTTPRequestHandler):
-    """Service that answers each request with a problem."""
+    """Service that answers with a problem, as such or in a list."""
 
     def do_GET(self) -> None:
-        body = json.dumps({"detail": "silent", "hint": "run `panelwright devices`"}).encode()
-        self.send_response(503)
+        body = json.dumps([PROBLEM] if self.path == "/v1/devices" else PROBLEM).encode()
+        self.send_response(200 if self.path == "/v1/devices" else 503)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
@@ -212,9 +217,10 @@ def test_the_hint_of_a_problem_names_the_service_that_was_asked() -> None:
         threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
         url = f"http://127.0.0.1:{server.server_port}"
         with pytest.raises(ApiError) as refused:
-            Client(url=url).get("/v1/devices")
+            Client(url=url).get("/v1/panel")
+        listed = Client(url=url).get("/v1/devices")
         server.shutdown()
-    assert refused.value.hint == f"run `panelwright devices --url {url}`"
+    assert refused.value.hint == listed[0]["hint"] == f"run `panelwright devices --url {url}`"
 
 
 def test_nobody_at_another_port_is_answered_with_that_port() -> None:

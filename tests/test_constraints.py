@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import sys
 import tomllib
-from collections.abc import Iterable
-from importlib.metadata import requires, version
+from collections.abc import Iterable, Iterator
+from importlib.metadata import packages_distributions, requires, version
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -14,10 +17,17 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 INSTALLED_EXTRAS = ("certify", "conform", "docs", "test")
 INSTALLER = "uv"
+ROOMS = ("drivers", "fusion", "hal", "manipulation", "perception", "service", "simbackend")
+NOT_IMPORTED = {"tzdata"}  # the time zones of `zoneinfo` on systems that have none
+FOR_OTHERS = {"bench", "docs", "test"}  # extras of what is not in the product
+
+
+def _project() -> Any:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
 def _asked_for() -> list[str]:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = _project()
     extras = (project["optional-dependencies"][extra] for extra in INSTALLED_EXTRAS)
     return [INSTALLER, *project["dependencies"], *(line for extra in extras for line in extra)]
 
@@ -63,3 +73,34 @@ def test_every_pin_has_hashes_and_no_address_of_a_registry() -> None:
     marks = [mark for _, *marks in blocks for mark in marks]
     assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", mark) for mark in marks)
     assert all(len(words) > 1 for words in blocks)
+
+
+def _imported() -> Iterator[str]:
+    """Yield the modules that the product's sources import, also by name with `import_module`."""
+    for node in (
+        n for room in ROOMS for path in (ROOT / room).rglob("*.py") for n in ast.walk(ast.parse(path.read_text()))
+    ):
+        match node:
+            case ast.Import():
+                yield from (alias.name for alias in node.names)
+            case ast.ImportFrom(module=str(name), level=0):
+                yield name
+            case ast.Call(func=ast.Name(id="import_module"), args=[ast.Constant(value=str(name)), *_]):
+                yield name
+
+
+def test_the_product_declares_what_it_imports_and_nothing_else() -> None:
+    project, installed = _project(), packages_distributions()
+    modules = {name.partition(".")[0] for name in _imported()} - set(sys.stdlib_module_names) - set(ROOMS)
+    assert not {module for module in modules if module not in installed}
+    imported = {canonicalize_name(name) for module in modules for name in installed[module]}
+    declared = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
+    optional = {
+        canonicalize_name(Requirement(line).name)
+        for extra, lines in project["optional-dependencies"].items()
+        if extra not in FOR_OTHERS
+        for line in lines
+    }
+    assert sorted(imported - declared - optional) == [], "imported, but not declared"
+    assert sorted(declared - imported - NOT_IMPORTED) == [], "declared, but not imported"
+    assert sorted(optional - imported) == [], "declared as an extra, but not imported"

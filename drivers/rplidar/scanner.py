@@ -18,6 +18,7 @@ from pydantic import Field
 from drivers.kinds.line_scanners import Beams, Bias, LineScanner, within
 from drivers.rplidar.express import CAPSULE_BYTES, EXPRESS_TYPE, REQUEST, CapsuleParser, Points
 from drivers.rplidar.nodes import NodeParser, decode
+from drivers.rplidar.times import MeasurementTimes
 from drivers.rplidar.turns import LARGEST_AGE, MOST_MISSING_RAD, Measurements, TurnCollector, missing_rad
 from drivers.transport.capture import inside
 from drivers.transport.link import Link, NoAnswer, Refused, drain_until_quiet, now_s
@@ -88,9 +89,7 @@ class Rplidar(LineScanner):
         self._pauses = Pauses()
         self._arrived_s = math.inf
         self._turn_s = now_s()
-        # The present turn: arrival time of its first chunk, and the number of measurements in that chunk.
-        self._begun: tuple[float, int] | None = None
-        self._measurement_s = 0.0
+        self._times, self._ended_s = MeasurementTimes(), math.inf  # end of the turn before
         self._missed = 0
         self._quality = Quality.VALID
 
@@ -116,7 +115,8 @@ class Rplidar(LineScanner):
         self._quality = Quality.DEGRADED if status == WARNING else Quality.VALID
         self._nodes, self._capsules, self._turns = NodeParser(), CapsuleParser(), TurnCollector()
         self._pauses.reset()
-        self._begun, self._arrived_s = None, math.inf
+        self._arrived_s = self._ended_s = math.inf
+        self._times.reset()
         self._turn_s = now_s() + SPIN_UP_S
         if self._is_express:
             rest = self._ask(link, REQUEST, descriptor(CAPSULE_BYTES, 1, EXPRESS_TYPE), 0, OLD_FIRMWARE)
@@ -144,7 +144,8 @@ class Rplidar(LineScanner):
     def receive(self, chunk: bytes, arrived_s: float) -> None:
         """Collect measurements and publish each complete turn; what may have been held up is left out."""
         if self._pauses.may_be_held_up(arrived_s, len(chunk)):
-            self._nodes, self._capsules, self._begun = NodeParser(), CapsuleParser(), None
+            self._nodes, self._capsules, self._ended_s = NodeParser(), CapsuleParser(), math.inf
+            self._times.reset()
         else:
             self._collect(chunk, arrived_s)
         self._arrived_s = arrived_s
@@ -161,6 +162,7 @@ class Rplidar(LineScanner):
         for points in batches:
             if points is None:
                 self.errors += 1
+                self._times.reset()  # measurements are lost, so their number is no clock
                 continue
             self._heard_s = max(self._heard_s, arrived_s)
             arrivals_s = np.where(np.arange(len(points[0])) < waited, min(self._arrived_s, arrived_s), arrived_s)
@@ -168,25 +170,23 @@ class Rplidar(LineScanner):
             head_rad, angle_rad, distance_m = points
             new = Measurements(head_rad=head_rad, angle_rad=angle_rad, distance_m=distance_m, arrived_s=arrivals_s)
             turns += list(self._turns.add(new))
+        self._times.add(arrived_s, self._turns.count + self._turns.pending + parser.pending)
         for turn, ended in turns:
-            self._finish(turn, arrived_s, self._turns.count - ended + self._turns.pending + parser.pending)
+            self._finish(turn, arrived_s, ended)
 
-    def _finish(self, turn: Measurements, arrived_s: float, behind: int) -> None:
+    def _finish(self, turn: Measurements, arrived_s: float, ended: int) -> None:
         """Publish a complete turn, without the measurements that a long gap left behind.
 
         Args:
-            arrived_s: when the chunk arrived.
-            behind: measurements since the end of the turn, assumed to take as long as those of the turn.
+            arrived_s: when the chunk arrived that confirmed the turn.
+            ended: measurements received up to the end of the turn.
         """
-        begun, self._begun = self._begun, (arrived_s, behind)
         if self.beams is None:
             return
         whole = len(turn) / max(1.0 - missing_rad(turn.head_rad) / math.tau, 0.5)
-        if begun is not None and (between := whole + behind - begun[1]) > whole / 2:
-            self._measurement_s = (arrived_s - begun[0]) / between  # over less, the jitter of the arrivals would count
-        each_s = self._measurement_s or self.beams.scan_s / whole
-        ended_s = min(arrived_s - behind * each_s, float(turn.arrived_s[-1]))
-        turn = turn.at(turn.arrived_s > ended_s - LARGEST_AGE * max(whole * each_s, self.beams.scan_s))
+        ended_s = min(self._times.taken_s(ended, self.beams.scan_s / whole), float(turn.arrived_s[-1]))
+        lasted_s, self._ended_s = ended_s - self._ended_s, ended_s
+        turn = turn.at(turn.arrived_s > ended_s - LARGEST_AGE * max(lasted_s, self.beams.scan_s))
         lacking_rad = missing_rad(turn.head_rad)
         if lacking_rad > MOST_MISSING_RAD:
             self._missed += 1

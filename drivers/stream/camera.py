@@ -94,7 +94,7 @@ class Freshness:
         )  # not by this gap itself
         self._gaps_s.append(gap_s)
         period_s = max(self._period_s, usual_s)
-        if gap_s > max(PAUSE_S, PAUSE_PERIODS * period_s) and not has_stamp:
+        if gap_s > max(PAUSE_S, PAUSE_PERIODS * period_s) and (self._is_draining or not has_stamp):
             self._is_draining = True
             return False
         if self._is_draining:

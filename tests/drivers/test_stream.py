@@ -215,9 +215,11 @@ def test_a_picture_that_lacks_one_byte_is_not_filled_up_by_the_line_break_behind
     assert [faults[n] for n in (0, 1, 2, 5, 6, 9, 10)] == 7 * [None]
 
 
-def test_a_second_picture_that_was_held_up_does_not_set_the_measure_for_itself() -> None:
+@pytest.mark.parametrize("has_stamp", [False, True])
+def test_a_second_picture_that_was_held_up_does_not_set_the_measure_for_itself(has_stamp: bool) -> None:
+    """A sender's stamps tell how late a picture is only after one that was not late."""
     fresh = Freshness(0.02)
-    assert [fresh.is_fresh(at_s, has_stamp=False) for at_s in (0.0, 0.17, 0.19, 0.21)] == [False, False, True, True]
+    assert [fresh.is_fresh(at_s, has_stamp=has_stamp) for at_s in (0.0, 0.17, 0.19, 0.21)] == [False, False, True, True]
 
 
 class Script:

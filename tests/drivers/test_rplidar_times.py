@@ -15,7 +15,7 @@ from hal.registry import Context
 @pytest.mark.parametrize("bursts", [1, 12])
 def test_a_burst_that_the_host_reads_late_does_not_make_its_turn_younger(mode: str, bursts: int) -> None:
     """Every seventh burst is read 8 ms late; the number of measurements shows when it came."""
-    device = Rplidar(Context(name="dut"), RplidarOptions.model_validate({"port": "/dev/null", "mode": mode}))
+    device = Rplidar(Context(name="scanner"), RplidarOptions.model_validate({"port": "/dev/null", "mode": mode}))
     begin_s, seen, ends_s = now_s(), 0, list[float]()
     range_m = np.linspace(1.0, 2.0, 384)
     turn = emulator.encode_turn(np.arange(384) * math.tau / 384, range_m)

@@ -7,7 +7,7 @@ import numpy as np
 from manipulation.arm import branches
 from manipulation.arm import kernels as arm_kernels
 from manipulation.control import braking, kernels
-from manipulation.planning import clearance, timing_kernels
+from manipulation.planning import clearance, rrt, timing_kernels
 
 
 def warm_up() -> None:
@@ -23,8 +23,10 @@ def warm_up() -> None:
     tool_ends, radii = np.zeros((1, 2, 3)), np.full(7, 0.01)
     box = (np.eye(3)[None], np.full((1, 3), 2.0), np.full((1, 3), 0.1))
     watched, pairs = np.ones((7, 1), bool), np.array([[0, 3]])
-    clearance.least_clearance(dh, q, tool_ends, radii, *box, watched, pairs, 0.01)
+    clearance.least_clearance(dh, q, tool_ends, radii, *box, watched, pairs, 0.01, 0.01)
     clearance.first_hit(dh, q, q + 0.1, 0.05, tool_ends, radii, *box, watched, pairs, 0.01)
+    roots, weights = np.array([q, q + 0.1]), np.ones(6)
+    rrt.grown(roots, roots, weights, 0.05, dh, tool_ends, radii, *box, watched, pairs, 0.01)
     clearance.all_clear(dh, q[None], tool_ends, radii, *box, watched, pairs, 0.01)
     clearance.overlap_counts(dh, q[None], tool_ends, radii, pairs)
     ends = clearance.capsule_ends(dh, q, tool_ends)

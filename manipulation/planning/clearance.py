@@ -23,50 +23,37 @@ def point_box(x: float, y: float, z: float, half: Array) -> float:
     return float(np.sqrt(ox * ox + oy * oy + oz * oz) + min(max(dx, dy, dz), 0.0))
 
 
-@compiled
-def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: Array) -> float:
-    """Return the least signed distance between the segment and the box (rotation: base_from_box)."""
-    a, b = np.empty(3), np.empty(3)
-    for k in range(3):
-        a[k] = b[k] = 0.0
-        for m in range(3):
-            a[k] += rotation[m, k] * (start[m] - middle[m])
-            b[k] += rotation[m, k] * (end[m] - middle[m])
-    d = b - a
-    low, high = 0.0, 1.0
-    t1, t2 = high - GOLDEN, GOLDEN
-    f1 = point_box(a[0] + t1 * d[0], a[1] + t1 * d[1], a[2] + t1 * d[2], half)
-    f2 = point_box(a[0] + t2 * d[0], a[1] + t2 * d[1], a[2] + t2 * d[2], half)
-    best = min(f1, f2, point_box(a[0], a[1], a[2], half), point_box(b[0], b[1], b[2], half))
+@inlined
+def span_box(cx: float, cy: float, cz: float, sx: float, sy: float, sz: float, half: Array) -> float:
+    """Return the least signed distance between a box and the segment from c - s to c + s, both in its axes."""
+    low, high = -1.0, 1.0
+    t1, t2 = high - 2.0 * GOLDEN, low + 2.0 * GOLDEN
+    f1 = point_box(cx + t1 * sx, cy + t1 * sy, cz + t1 * sz, half)
+    f2 = point_box(cx + t2 * sx, cy + t2 * sy, cz + t2 * sz, half)
+    best = min(f1, f2, point_box(cx - sx, cy - sy, cz - sz, half), point_box(cx + sx, cy + sy, cz + sz, half))
     for _ in range(SEARCH_STEPS):
         if f1 < f2:
             high, t2, f2 = t2, t1, f1
             t1 = high - GOLDEN * (high - low)
-            f1 = point_box(a[0] + t1 * d[0], a[1] + t1 * d[1], a[2] + t1 * d[2], half)
+            f1 = point_box(cx + t1 * sx, cy + t1 * sy, cz + t1 * sz, half)
             best = min(best, f1)
         else:
             low, t1, f1 = t1, t2, f2
             t2 = low + GOLDEN * (high - low)
-            f2 = point_box(a[0] + t2 * d[0], a[1] + t2 * d[1], a[2] + t2 * d[2], half)
+            f2 = point_box(cx + t2 * sx, cy + t2 * sy, cz + t2 * sz, half)
             best = min(best, f2)
-    return best
+    return float(best)
 
 
-@inlined
-def outside_of_box(middle: Array, half_span: Array, rotation: Array, half: Array) -> float:
-    """Return a lower bound of the distance of a segment from a box: that of the box around it in the box's axes.
-
-    `middle` and `half_span` (3,) of the segment are given from the middle of the box, in the axes of the base.
-    """
-    total = 0.0
+@compiled
+def segment_box(start: Array, end: Array, rotation: Array, middle: Array, half: Array) -> float:
+    """Return the least signed distance between the segment and the box (rotation: base_from_box)."""
+    c, s = np.zeros(3), np.zeros(3)
     for k in range(3):
-        place, reach = 0.0, 0.0
         for m in range(3):
-            place += rotation[m, k] * middle[m]
-            reach += rotation[m, k] * half_span[m]
-        gap = max(0.0, abs(place) - abs(reach) - half[k])
-        total += gap * gap
-    return float(np.sqrt(total)) if total > 0.0 else -1e9
+            c[k] += rotation[m, k] * (0.5 * (start[m] + end[m]) - middle[m])
+            s[k] += rotation[m, k] * 0.5 * (end[m] - start[m])
+    return span_box(c[0], c[1], c[2], s[0], s[1], s[2], half)
 
 
 @compiled
@@ -75,19 +62,21 @@ def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
 
     Source: Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
     """
-    d1, d2, r = q1 - p1, q2 - p2, p1 - p2
-    a, e = np.dot(d1, d1), np.dot(d2, d2)
-    f = np.dot(d2, r)
+    ux, uy, uz = q1[0] - p1[0], q1[1] - p1[1], q1[2] - p1[2]
+    vx, vy, vz = q2[0] - p2[0], q2[1] - p2[1], q2[2] - p2[2]
+    rx, ry, rz = p1[0] - p2[0], p1[1] - p2[1], p1[2] - p2[2]
+    a, e = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
+    f = vx * rx + vy * ry + vz * rz
     if a <= 1e-12 and e <= 1e-12:
-        return float(np.sqrt(np.dot(r, r)))
+        return float(np.sqrt(rx * rx + ry * ry + rz * rz))
     if a <= 1e-12:
         s, t = 0.0, min(max(f / e, 0.0), 1.0)
     else:
-        c = np.dot(d1, r)
+        c = ux * rx + uy * ry + uz * rz
         if e <= 1e-12:
             s, t = min(max(-c / a, 0.0), 1.0), 0.0
         else:
-            b = np.dot(d1, d2)
+            b = ux * vx + uy * vy + uz * vz
             denominator = a * e - b * b
             s = min(max((b * f - c * e) / denominator, 0.0), 1.0) if denominator > 1e-12 else 0.0
             t = (b * s + f) / e
@@ -95,8 +84,8 @@ def segment_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> float:
                 s, t = min(max(-c / a, 0.0), 1.0), 0.0
             elif t > 1.0:
                 s, t = min(max((b - c) / a, 0.0), 1.0), 1.0
-    gap = r + s * d1 - t * d2
-    return float(np.sqrt(np.dot(gap, gap)))
+    gx, gy, gz = rx + s * ux - t * vx, ry + s * uy - t * vy, rz + s * uz - t * vz
+    return float(np.sqrt(gx * gx + gy * gy + gz * gz))
 
 
 @compiled
@@ -129,42 +118,57 @@ def least_clearance(
     halves: Array,
     watched: Mask,
     pairs: Index,
+    stop_below: float,
     enough: float,
 ) -> float:
     """Return the least gap (m, negative when overlapping) over all watched capsule-box pairs and self pairs.
 
-    `watched`: (capsules, boxes) of bool. For gaps above `enough` a lower bound may be returned, and the first gap below
-    it ends the search, so a validity check is cheap. With `enough` infinite the result is exact.
+    `watched`: (capsules, boxes) of bool. The first gap below `stop_below` ends the search, and for a least gap above
+    `enough` a lower bound that is not below it may be returned. With both infinite the result is exact.
     """
     ends = capsule_ends(dh, q, tool_ends)
+    count, boxes = ends.shape[0], halves.shape[0]
     least = np.inf
-    for i in range(ends.shape[0]):
-        for j in range(halves.shape[0]):
-            if watched[i, j]:
-                # The bounding sphere of the box, then the box around the segment, rule out most pairs.
-                reach = np.sqrt(np.dot(halves[j], halves[j]))
-                centre = 0.5 * (ends[i, 0] + ends[i, 1])
-                span = ends[i, 1] - ends[i, 0]
-                apart = centre - middles[j]
-                bound = np.sqrt(np.dot(apart, apart)) - reach - 0.5 * np.sqrt(np.dot(span, span)) - radii[i]
-                if bound >= min(least, enough):
-                    least = min(least, bound)
-                    continue
-                bound = outside_of_box(centre - middles[j], 0.5 * span, rotations[j], halves[j]) - radii[i]
-                if bound >= min(least, enough):
-                    least = min(least, bound)
-                    continue
-                gap = segment_box(ends[i, 0], ends[i, 1], rotations[j], middles[j], halves[j]) - radii[i]
-                least = min(least, gap)
-                if least < enough < np.inf:
-                    return float(least)
+    reach = np.empty(boxes)
+    for j in range(boxes):
+        reach[j] = np.sqrt(halves[j, 0] ** 2 + halves[j, 1] ** 2 + halves[j, 2] ** 2)
+    for i in range(count - 1, -1, -1):  # the hand first, because it is the nearest to something most of the time
+        a, b = ends[i, 0], ends[i, 1]
+        x, y, z = 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])
+        u, v, w = 0.5 * (b[0] - a[0]), 0.5 * (b[1] - a[1]), 0.5 * (b[2] - a[2])
+        length = np.sqrt(u * u + v * v + w * w)
+        for j in range(boxes):
+            if not watched[i, j]:
+                continue
+            # The spheres around both, then the box around the segment, rule out most pairs.
+            dx, dy, dz = x - middles[j, 0], y - middles[j, 1], z - middles[j, 2]
+            gap = np.sqrt(dx * dx + dy * dy + dz * dz) - reach[j] - length - radii[i]
+            if gap < min(least, enough):
+                r, half = rotations[j], halves[j]
+                cx, sx = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz, r[0, 0] * u + r[1, 0] * v + r[2, 0] * w
+                cy, sy = r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz, r[0, 1] * u + r[1, 1] * v + r[2, 1] * w
+                cz, sz = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz, r[0, 2] * u + r[1, 2] * v + r[2, 2] * w
+                gap = max(gap, around(abs(cx) - abs(sx), abs(cy) - abs(sy), abs(cz) - abs(sz), half) - radii[i])
+                if gap < min(least, enough):
+                    gap = span_box(cx, cy, cz, sx, sy, sz, half) - radii[i]
+            least = min(least, gap)
+            if least < stop_below:
+                return float(least)
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         gap = segment_segment(ends[i, 0], ends[i, 1], ends[j, 0], ends[j, 1]) - radii[i] - radii[j]
         least = min(least, gap)
-        if least < enough < np.inf:
+        if least < stop_below:
             return float(least)
     return float(least)
+
+
+@inlined
+def around(x: float, y: float, z: float, half: Array) -> float:
+    """Return the distance from a box to a point at (|x|, |y|, |z|) in its axes, and a number below any gap inside it."""
+    dx, dy, dz = max(0.0, x - half[0]), max(0.0, y - half[1]), max(0.0, z - half[2])
+    total = dx * dx + dy * dy + dz * dz
+    return float(np.sqrt(total)) if total > 0.0 else -1e9
 
 
 @compiled
@@ -193,7 +197,8 @@ def first_hit(
     k = 1
     while k <= count:
         q = start + (k / count) * (end - start)
-        gap = least_clearance(dh, q, tool_ends, radii, rotations, middles, halves, watched, pairs, np.inf)
+        enough = margin + (count - k + 1) * way  # a larger gap leaves out no more steps
+        gap = least_clearance(dh, q, tool_ends, radii, rotations, middles, halves, watched, pairs, margin, enough)
         if gap < margin:
             return (k - 1) / count
         k += 1 + int(min((gap - margin) / max(way, 1e-12), 1.0 * count))
@@ -231,7 +236,9 @@ def all_clear(
 ) -> bool:
     """Return whether the gaps at all configurations (m, n) are at least the margin."""
     for row in range(samples.shape[0]):
-        gap = least_clearance(dh, samples[row], tool_ends, radii, rotations, middles, halves, watched, pairs, margin)
+        gap = least_clearance(
+            dh, samples[row], tool_ends, radii, rotations, middles, halves, watched, pairs, margin, margin
+        )
         if gap < margin:
             return False
     return True

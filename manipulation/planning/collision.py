@@ -92,17 +92,20 @@ class CollisionModel:
         return links + tuple(c.name for c in self.tool)
 
     def clearance_m(self, q_rad: Array, *, enough_m: float = np.inf) -> float:
-        """Return the least gap over all watched pairs, m, negative when something overlaps."""
-        return float(
-            clearance.least_clearance(
-                self.kinematics.dh, q_rad, self.tool_ends, self.radii, self.rotations, self.middles, self.halves,
-                self.watched, self.self_pairs, enough_m,
-            )
-        )  # fmt: skip
+        """Return the least gap over all watched pairs, m, negative when something overlaps; or any above `enough_m`."""
+        return self._least_m(q_rad, -np.inf, enough_m)
 
     def is_clear(self, q_rad: Array, *, margin_m: float) -> bool:
         """Return whether every watched gap is at least the margin."""
-        return self.clearance_m(q_rad, enough_m=margin_m) >= margin_m
+        return self._least_m(q_rad, margin_m, margin_m) >= margin_m
+
+    def _least_m(self, q_rad: Array, stop_below_m: float, enough_m: float) -> float:
+        return float(
+            clearance.least_clearance(
+                self.kinematics.dh, q_rad, self.tool_ends, self.radii, self.rotations, self.middles, self.halves,
+                self.watched, self.self_pairs, stop_below_m, enough_m,
+            )
+        )  # fmt: skip
 
     def are_clear(self, samples_rad: Array, *, margin_m: float) -> bool:
         """Return whether every watched gap is at least the margin at all of the joint vectors (m, n)."""

@@ -1,7 +1,6 @@
-"""RRT-Connect in joint space.
+"""RRT-Connect in joint space, compiled as a whole.
 
 OMPL is not used, because it has one random seed per process instead of one per plan, and calls Python for every state.
-Here a check takes microseconds, and the whole search consists of a few compiled calls.
 
 Source: Kuffner and LaValle, ICRA 2000; shortcuts after Geraerts and Overmars, IJRR 26(8), 2007.
 """
@@ -12,101 +11,154 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hal.arrays import Array
+from hal.arrays import Array, Mask
+from hal.jit import compiled, inlined
+from manipulation.planning.clearance import Index, first_hit
+from manipulation.planning.collision import CollisionModel
 
 Free = Callable[[Array, Array], float]
 """`free(start, end)`: fraction of the straight segment that is free."""
 
-
+STEP_RAD = 0.5  # of the trees
+BLOCKED, CUT, FREE, REACHED = range(4)  # how far a step came: no way, up to an obstacle, a whole step, the target
+ROOM = 256  # configurations of a tree at first
+LEAST_STEP_RAD = 0.02  # a shorter free part of a step is not added
+LAST_WEIGHT = 0.4  # of the last joint in distances; the first joints sweep the largest volumes
 WORTH = 0.99  # a shortcut that saves less is not checked
 
 
-class _Tree:
-    """Configurations and their parents, in growing arrays."""
-
-    def __init__(self, root: Array, weights: Array) -> None:
-        self._q = np.empty((256, len(root)))
-        self._q[0] = root
-        self._parent = [-1]
-        self._weights = weights
-
-    def nearest(self, q: Array) -> int:
-        gaps = (self._q[: len(self._parent)] - q) * self._weights
-        return int(np.argmin(np.einsum("ij,ij->i", gaps, gaps)))
-
-    def add(self, q: Array, parent: int) -> int:
-        count = len(self._parent)
-        if count == len(self._q):
-            self._q = np.concatenate([self._q, np.empty_like(self._q)])
-        self._q[count] = q
-        self._parent.append(parent)
-        return count
-
-    def configuration(self, index: int) -> Array:
-        return np.array(self._q[index])
-
-    def branch(self, index: int) -> list[Array]:
-        out = []
-        while index >= 0:
-            out.append(self.configuration(index))
-            index = self._parent[index]
-        return out[::-1]
-
-
 def connect(
+    model: CollisionModel,
     start: Array,
     goal: Array,
     *,
-    free: Free,
+    margin_m: float,
+    check_rad: float,
     lower: Array,
     upper: Array,
     seed: int,
-    step_rad: float = 0.5,
-    max_nodes: int = 4000,
+    rounds: int,
 ) -> Array | None:
-    """Return a path (N, n) of free straight segments from start to goal, or None when the search ran out of nodes."""
-    rng = np.random.default_rng(seed)
-    weights = np.linspace(1.0, 0.4, len(start))  # the first joints sweep the largest volumes
-    trees = [_Tree(start, weights), _Tree(goal, weights)]
-    active = 0
-    for _ in range(max_nodes):
-        target = rng.uniform(lower, upper)
-        new = _extend(trees[active], target, free, step_rad)
-        if new is not None:
-            met = _connect(trees[1 - active], trees[active].configuration(new), free, step_rad)
-            if met is not None:
-                first, second = (new, met) if active == 0 else (met, new)
-                return np.array(trees[0].branch(first) + trees[1].branch(second)[::-1][1:])
-        active = 1 - active
-    return None
+    """Return a path (N, n) of free straight segments from start to goal, or None when the rounds are over.
+
+    In each round one tree grows towards a random place between `lower` and `upper`, and the other one towards it.
+    """
+    places = np.random.default_rng(seed).uniform(lower, upper, (rounds, len(start)))
+    weights = np.linspace(1.0, LAST_WEIGHT, len(start))
+    path = grown(
+        places, np.array([start, goal]), weights, check_rad, model.kinematics.dh, model.tool_ends, model.radii,
+        model.rotations, model.middles, model.halves, model.watched, model.self_pairs, margin_m,
+    )  # fmt: skip
+    return path if len(path) else None
 
 
-def _extend(tree: _Tree, target: Array, free: Free, step_rad: float) -> int | None:
-    """Make one step towards the target, cut at the first obstacle; None when it cannot move."""
-    near = tree.nearest(target)
-    q = tree.configuration(near)
-    ahead = target - q
-    length = float(np.max(np.abs(ahead)))
-    if length < 1e-9:
-        return near
-    end = q + ahead * min(1.0, step_rad / length)
-    fraction = free(q, end)
-    if fraction * min(step_rad, length) < 0.02:
-        return None
-    return tree.add(q + fraction * (end - q), near)
+@compiled
+def grown(
+    places: Array,
+    roots: Array,
+    weights: Array,
+    check_rad: float,
+    dh: Array,
+    tool_ends: Array,
+    radii: Array,
+    rotations: Array,
+    middles: Array,
+    halves: Array,
+    watched: Mask,
+    pairs: Index,
+    margin: float,
+) -> Array:
+    """Grow a tree from each of the two `roots` (2, n) until they meet; returns the path between them, or none (0, n)."""
+    n = roots.shape[1]
+    trees, parents, counts = np.empty((2, ROOM, n)), np.full((2, ROOM), -1), np.ones(2, np.int64)
+    trees[:, 0] = roots
+    for row in range(places.shape[0]):
+        side, target = row % 2, places[row]
+        for grows in (side, 1 - side):
+            how = CUT
+            while True:
+                if counts[grows] == trees.shape[1]:
+                    trees, parents = with_room(trees), np.concatenate((parents, parents), axis=1)
+                how = extended(
+                    trees[grows], parents[grows], counts[grows], target, weights, check_rad, dh, tool_ends, radii,
+                    rotations, middles, halves, watched, pairs, margin,
+                )  # fmt: skip
+                counts[grows] += how > BLOCKED
+                if how != FREE or grows == side:
+                    break
+            if grows == side:
+                if how == BLOCKED:
+                    break
+                target = trees[side, counts[side] - 1].copy()
+            elif how == REACHED:
+                return joined(trees, parents, counts)
+    return np.empty((0, n))
 
 
-def _connect(tree: _Tree, target: Array, free: Free, step_rad: float) -> int | None:
-    """Step towards the target until it is reached (returns its index) or an obstacle stops the steps (None)."""
-    while True:
-        new = _extend(tree, target, free, step_rad)
-        if new is None:
-            return None
-        reached = tree.configuration(new)
-        if np.max(np.abs(reached - target)) < 1e-9:
-            return new
-        if free(reached, reached + 1e-3 * (target - reached)) < 1.0:
-            return None
+@inlined
+def extended(
+    tree: Array,
+    parents: Index,
+    count: int,
+    target: Array,
+    weights: Array,
+    check_rad: float,
+    dh: Array,
+    tool_ends: Array,
+    radii: Array,
+    rotations: Array,
+    middles: Array,
+    halves: Array,
+    watched: Mask,
+    pairs: Index,
+    margin: float,
+) -> int:
+    """Make one step of a tree of `count` configurations towards `target`; returns how far it came."""
+    near, least = 0, np.inf
+    for i in range(count):
+        total = 0.0
+        for k in range(target.shape[0]):
+            gap = (tree[i, k] - target[k]) * weights[k]
+            total += gap * gap
+        if total < least:
+            near, least = i, total
+    way = target - tree[near]
+    length = np.max(np.abs(way))
+    share = min(1.0, STEP_RAD / max(length, 1e-9))
+    free = first_hit(
+        dh, tree[near], tree[near] + share * way, check_rad, tool_ends, radii, rotations, middles, halves, watched,
+        pairs, margin,
+    )  # fmt: skip
+    if free * share * length < min(LEAST_STEP_RAD, length):
+        return BLOCKED
+    tree[count] = target if free * share == 1.0 else tree[near] + free * share * way
+    parents[count] = near
+    return CUT if free < 1.0 else REACHED if share == 1.0 else FREE
+
+
+@inlined
+def with_room(trees: Array) -> Array:
+    """Return the trees with room for twice as many configurations."""
+    return np.concatenate((trees, np.empty_like(trees)), axis=1)
+
+
+@inlined
+def joined(trees: Array, parents: Index, counts: Index) -> Array:
+    """Return the path from the first root to the second one through the newest configurations, which are the same."""
+    n = trees.shape[2]
+    steps = np.zeros(2, np.int64)
+    for side in range(2):
+        i = counts[side] - 1
+        while i >= 0:
+            steps[side] += 1
+            i = parents[side, i]
+    out = np.empty((steps[0] + steps[1] - 1, n))
+    for side in range(2):
+        i, row = counts[side] - 1, steps[0] - 1
+        while i >= 0:
+            out[row] = trees[side, i]
+            i, row = parents[side, i], row + (1 if side else -1)
+    return out
 
 
 def shortcut(path: Array, *, free: Free, seed: int, rounds: int = 80) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,14 +25,14 @@ REACHES = 0.5 ** np.arange(7)  # widths of a corner's rounding that are tried, i
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
-    """How long to search for a path: the largest number of searches, and of nodes per search."""
+    """How long to search for a path: the largest number of searches, and of rounds in the last one."""
 
     searches: int
-    nodes: int
+    rounds: int
 
 
-THOROUGH = Effort(searches=4, nodes=4000)  # takes ten seconds if there is no path
-QUICK = Effort(searches=2, nodes=400)  # far more than the searches of typical missions need (at most 24 nodes)
+THOROUGH = Effort(searches=6, rounds=8000)
+QUICK = Effort(searches=2, rounds=400)  # far more than the searches of typical missions need (at most 24 nodes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,21 +73,27 @@ class TransferPlanner:
 
         if self.model.free_fraction(start_rad, goal_rad, margin_m=margin) == 1.0:
             return self._timed(SmoothPath.of(np.array([start_rad, goal_rad])), name, guards)
-        kin = self.model.kinematics
-        lower, upper = self._search_range(start_rad, goal_rad)
-        for attempt in range(effort.searches):
-            seed = self.seed + attempt
-            path = connect(start_rad, goal_rad, free=free, lower=lower, upper=upper, seed=seed, max_nodes=effort.nodes)
-            if path is None:
-                lower, upper = kin.lower_rad, kin.upper_rad
-                continue
+        for seed, path in enumerate(self._paths(start_rad, goal_rad, margin, effort), self.seed):
             rounded = self._rounded(shortcut(path, free=free, seed=seed), margin)
             if rounded is not None:
                 return self._timed(rounded, name, guards)
         raise Unreachable(
-            f"{name}: no collision-free path was found, by {effort.searches} x {effort.nodes} steps of search",
+            f"{name}: no collision-free path was found, in {effort.searches} searches of up to {effort.rounds} rounds",
             hint=f"the tightest place of the straight way is between {self._in_the_way(start_rad, goal_rad, margin)}",
         )
+
+    def _paths(self, start: Array, goal: Array, margin: float, effort: Effort) -> Iterator[Array]:
+        """Yield free paths (N, n), from search to search with twice as many rounds: a search that is lucky is short."""
+        kin = self.model.kinematics
+        lower, upper = self._search_range(start, goal)
+        for search in range(effort.searches):
+            path = connect(
+                self.model, start, goal, margin_m=margin, check_rad=SEARCH_STEP_RAD, lower=lower, upper=upper,
+                seed=self.seed + search, rounds=effort.rounds >> (effort.searches - 1 - search),
+            )  # fmt: skip
+            if path is not None:
+                yield path
+            lower, upper = kin.lower_rad, kin.upper_rad
 
     def _margin(self, start: Array, goal: Array) -> float:
         """Return the wanted margin, or a smaller one if the gaps at both ends require it."""
@@ -106,7 +114,13 @@ class TransferPlanner:
         return lower, upper
 
     def _rounded(self, path: Array, margin: float) -> SmoothPath | None:
-        """Round each corner as widely as its legs and the obstacles allow; None if one cannot be rounded."""
+        """Round each corner as widely as its legs and the obstacles allow; None if one cannot be rounded.
+
+        The legs are checked again, because the spacing of the search misses a thin obstacle such as a cable.
+        """
+        legs = itertools.pairwise(path)
+        if any(self.model.free_fraction(a, b, margin_m=END_SHARE * margin) < 1.0 for a, b in legs):
+            return None
         smooth = SmoothPath.of(path)
         for index in range(1, len(smooth.points_rad) - 1):
             most = float(smooth.reaches_rad[index])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hal.errors import Unreachable
 from hal.geometry import identity, transform_rpy
-from hal.panel import Lever, Panel, Slider
+from hal.panel import Lever, Panel, Shown, Slider, Toggle
 from hal.strict import validate
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning import clearance
@@ -98,6 +99,20 @@ def test_a_transfer_goes_round_a_divider_and_every_five_milliradians_are_free() 
         assert planner.model.free_fraction(a, b, margin_m=0.0, step_rad=RECHECK_RAD) == 1.0
 
 
+def test_a_post_between_the_steps_of_a_search_is_found_before_the_arm_moves() -> None:
+    """A search looks every 20 mrad, in which a finger may pass a cable."""
+    finger = Capsule(name="finger", start_m=(0.0, 0.0, 0.10), end_m=(0.0, 0.0, 0.25), radius_m=0.002)
+    start, goal = (np.array([side, 0.6, 0.2, 0.0, 0.6, 0.0]) for side in (-0.3, 0.3))
+    between = KINEMATICS.flange(start + 10.5 / 30 * (goal - start)) * transform_rpy((0.0, 0.0, 0.2), (0, 0, 0))
+    post = CollisionBox(name="post", parent_from_box=between, half_m=(0.0005, 0.0005, 0.0005))
+    planner = replace(_planner(), model=CollisionModel.build(KINEMATICS, [finger], [post]))
+    path, margin = np.array([start, 0.5 * (start + goal), goal]), 0.001
+    spacing = {step: planner.model.free_fraction(start, goal, margin_m=margin, step_rad=step) for step in (0.02, 0.005)}
+    assert spacing[0.02] == 1.0 > spacing[0.005]
+    assert planner._rounded(path, margin) is None
+    assert replace(planner, model=planner.model.with_boxes([]))._rounded(path, margin) is not None
+
+
 def test_the_same_seed_gives_the_same_path() -> None:
     start, goal, wall = _obstacle()
     first, second = (_planner(wall, seed=4).plan(start, goal) for _ in range(2))
@@ -126,6 +141,27 @@ def test_steps_are_left_out_only_where_every_one_of_them_is_free(seed: int) -> N
             expected = (k - 1) / count
             break
     assert model.free_fraction(a, b, margin_m=0.008, step_rad=0.02) == expected
+
+
+def test_the_nearest_of_several_things_at_an_end_sets_the_margin() -> None:
+    """With the gap of another one, which is larger, every way to the goal would count as blocked."""
+    goal = np.array([0.5, 0.6, 0.4, 0.0, 0.6, 0.0])
+    flange = KINEMATICS.flange(goal)
+    path = KINEMATICS.follow_from(goal, [flange * transform_rpy((0.0, 0.0, -back), (0, 0, 0)) for back in (0.04, 0.08)])
+    assert path is not None
+    half = (0.02, 0.02, 0.005)
+    beside = [
+        CollisionBox(
+            name=name,
+            parent_from_box=flange * transform_rpy((side * (0.04 + gap + half[0]), 0.0, 0.12), (0, 0, 0)),
+            half_m=half,
+        )
+        for name, side, gap in (("further", 1.0, 0.007), ("nearer", -1.0, 0.003))
+    ]
+    for boxes in (beside, beside[::-1]):
+        planner = _planner(*boxes)
+        assert planner.model.clearance_m(goal, enough_m=0.008) == pytest.approx(0.003, abs=1e-4)
+        assert np.allclose(planner.plan(path[-1], goal).positions_rad[-1], goal)
 
 
 def test_a_goal_inside_an_obstacle_is_unreachable_and_named() -> None:
@@ -162,7 +198,12 @@ def test_the_envelope_of_a_lever_follows_its_angle() -> None:
     panel = make_panel()
     lever = panel.object("valve")
     assert isinstance(lever, Lever)
-    sideways = envelope(lever, angle_rad=np.pi / 2)
+    sideways = envelope(lever, Shown(value=np.pi / 2))
+    assert np.allclose(
+        sideways.parent_from_box.as_matrix(),
+        envelope(lever, Shown(state="closed")).parent_from_box.as_matrix(),
+        atol=1e-5,
+    )
     # A quarter turn clockwise from up points to +x.
     assert sideways.parent_from_box.translation[0] == pytest.approx(lever.length_m / 2)
     assert sideways.parent_from_box.translation[1] == pytest.approx(0.0, abs=1e-9)
@@ -177,6 +218,28 @@ def test_the_envelope_of_a_slider_covers_its_track() -> None:
     along = box.parent_from_box.rotation.apply([1, 0, 0])
     assert abs(along @ [0, 1, 0]) == pytest.approx(1.0)
     assert box.half_m[0] == pytest.approx((slider.travel_m + slider.cap_size_m[0]) / 2)
+
+
+def test_a_slider_whose_value_is_known_blocks_only_the_place_of_its_cap() -> None:
+    slider = make_panel().object("fader")
+    assert isinstance(slider, Slider)
+    box = envelope(slider, Shown(value=1.0))
+    assert np.allclose(box.parent_from_box.translation[:2], [0.1, 0.04]), "its track points up"
+    least = slider.cap_size_m[0] / 2
+    assert least < box.half_m[0] < least + 0.05 * slider.travel_m
+    assert envelope(slider, Shown(state="?")).half_m == envelope(slider).half_m
+
+
+@pytest.mark.parametrize(("state", "side"), [("on", 1.0), ("off", -1.0)])
+def test_a_toggle_in_a_known_state_blocks_only_the_side_of_its_bat(state: str, side: float) -> None:
+    toggle = validate({"kind": "toggle", "name": "pump", "position_m": [0.0, 0.0]}, Toggle, source="test")
+    whole, part = envelope(toggle), envelope(toggle, Shown(state=state))
+    tip = side * toggle.bat_length_m * np.sin(toggle.tilt_rad)
+    for y in (0.0, tip):
+        assert abs(y - part.parent_from_box.translation[1]) + toggle.bat_radius_m <= part.half_m[1]
+    other_edge = -tip - side * toggle.bat_radius_m
+    assert abs(other_edge - part.parent_from_box.translation[1]) > part.half_m[1]
+    assert part.half_m[1] < 0.8 * whole.half_m[1] and part.half_m[::2] == whole.half_m[::2]
 
 
 def test_the_boxes_of_a_panel_move_with_it_and_the_plate_lies_behind_its_face() -> None:

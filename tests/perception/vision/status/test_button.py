@@ -10,7 +10,9 @@ import pytest
 
 from hal.panel import LATCHED_SHARE, Button, Mushroom
 from perception.vision.patch import Patch
+from perception.vision.status import button
 from perception.vision.status.button import read_button
+from perception.vision.status.press import CapHeight
 
 SIZE, PX_PER_M = 160, 2500.0
 LEAN = 0.42  # tangent of the camera's viewing angle
@@ -51,6 +53,22 @@ def test_the_ring_round_a_black_cap_is_not_taken_for_its_edge(depth: float, ring
     """The edge of the ring is where that of a released cap would be."""
     patch = seen_aslant(BUTTON.height_m - depth * BUTTON.travel_m, cap=18, ring=20, ring_m=ring_m)
     assert read_button(patch, BUTTON).state in ("pressed", None)
+
+
+@pytest.mark.parametrize(
+    ("above", "sigma", "state"),
+    [(0.5, 0.02, "released"), (-0.5, 0.02, "pressed"), (0.13, 0.2, None), (-0.13, 0.2, None), (0.5, 1.0, None)],
+)
+def test_a_height_between_both_states_or_measured_badly_is_not_answered(
+    above: float, sigma: float, state: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pressed black cap in a black ring was measured 0.13 of its way above the middle, +- 0.2 of it, which is wrong."""
+    cap, patch = BUTTON.cap, seen_aslant(BUTTON.height_m, cap=90, ring=20)
+    assert cap is not None
+    way_m = cap.pressed_depth_m
+    measured = CapHeight(height_m=cap.height_m - way_m / 2 + above * way_m, sigma_m=sigma * way_m, found=1.0)
+    monkeypatch.setattr(button, "cap_height", lambda *_, **__: measured)
+    assert read_button(patch, BUTTON).state == state
 
 
 def test_a_latched_cap_is_less_deep_than_one_that_is_held() -> None:

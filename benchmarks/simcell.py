@@ -17,7 +17,7 @@ from hal.clock import SimClock
 from hal.config import Cell, load_cell
 from hal.devices import DeviceKind
 from hal.geometry import UncertainPose, perturbed
-from hal.panel import load_panel
+from hal.panel import Shown, load_panel
 from hal.registry import Context, Shared, connect
 from hal.simulated import ObjectTruth
 from manipulation.control.controller import Controller
@@ -127,8 +127,8 @@ def open_bench(
     )
     bench = SimBench(file, clock, shared, made["arm"], controller, skill_context, latched, rng, made)
     levers = [panel_object.name for panel_object in file.panel.objects if panel_object.kind == "lever"]
-    angles = {name: float(bench.truth(name).value or 0.0) for name in levers}
-    bench.context = replace(skill_context, angles_rad=angles)
+    shown = {name: Shown(value=float(bench.truth(name).value or 0.0)) for name in levers}
+    bench.context = replace(skill_context, shown=shown)
     return bench
 
 

@@ -26,7 +26,7 @@ from hal.arrays import Array
 from hal.config import load_cell
 from hal.errors import Unreachable
 from hal.geometry import perturbed, transform_rpy
-from hal.panel import Panel
+from hal.panel import Panel, Shown
 from hal.strict import validate
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.collision import RECHECK_RAD, CollisionModel, placed
@@ -82,10 +82,10 @@ def tour(arm: str, seed: int) -> Iterator[Leg]:
     )
     grip = RigidTransform.from_translation([0.0, 0.0, 0.21])
     kinematics = Kinematics.of(MODELS[arm]().capabilities)
-    angles = {one.name: angle for one in panel.objects for angle in list(one.resting_angles.values())[:1]}
+    shown = {one.name: Shown(state=state) for one in panel.objects for state in one.states_shown[:1]}
     boxes = (
         floor_box(cell.workspace.floor_z_m),
-        *placed((*panel_boxes(panel, angles), *(_cables(panel, rng) if seed % 2 else ())), base_from_panel),
+        *placed((*panel_boxes(panel, shown), *(_cables(panel, rng) if seed % 2 else ())), base_from_panel),
     )
     model = CollisionModel.build(kinematics, Hand().capsules(grip, WIDTH_M)).with_boxes(boxes)
     limits = SpeedLimits(tip_m_per_s=cell.safety.speed_limit_m_per_s)

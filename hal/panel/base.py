@@ -97,8 +97,8 @@ class PanelObject(Strict, ABC):
         return self.half_footprint_m
 
     @abstractmethod
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """Return the box that contains it in any state or, if that is smaller, at `angle_rad`."""
+    def envelope(self, shown: Shown | None = None) -> Envelope:
+        """Return the box that contains it in any state or, if that is smaller, as it is `shown`."""
 
     @property
     def rim(self) -> Rim | None:
@@ -139,6 +139,12 @@ class PanelObject(Strict, ABC):
     def resting_angles(self) -> Mapping[str, float]:
         """Angle of each state, rad clockwise from up; empty if the states are not angles."""
         return {}
+
+    def angle_of(self, shown: Shown) -> float | None:
+        """Return the angle that is shown, rad clockwise from up: the value if that is one, or the angle of the state."""
+        if self.value_is_angle and shown.value is not None:
+            return shown.value
+        return None if shown.state is None else self.resting_angles.get(shown.state)
 
     def is_right(self, said: Shown, truth: Shown) -> bool:
         """Return whether a reading is correct: states and texts must be equal, values within 2 % of full scale."""

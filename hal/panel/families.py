@@ -8,6 +8,7 @@ from pydantic import Field
 
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face, Rim
+from hal.panel.goals import Shown
 from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, radius_of
 
@@ -33,7 +34,7 @@ class Round(PanelObject):
         """Half width and half height, which are its radius."""
         return self.radius_m, self.radius_m
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
+    def envelope(self, shown: Shown | None = None) -> Envelope:
         """Return a box around the object."""
         return Envelope(half_m=self.half_footprint_m, height_m=max(self.height_m, LEAST_HEIGHT_M))
 
@@ -77,7 +78,7 @@ class Rectangular(PanelObject):
         """Half width and half height of its outline."""
         return self.width_m / 2, self.height_m / 2
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
+    def envelope(self, shown: Shown | None = None) -> Envelope:
         """Return a box around the object."""
         return Envelope(half_m=self.half_footprint_m, height_m=max(self.out_m, LEAST_HEIGHT_M))
 

@@ -8,6 +8,7 @@ from hal.panel.angles import PointerScale
 from hal.panel.base import PanelObject
 from hal.panel.families import LEAST_HEIGHT_M
 from hal.panel.form import Envelope, Face, Rim, circle
+from hal.panel.goals import Shown
 from hal.panel.parts import NotNegative, Positive, Vector2
 from hal.panel.questions import Question, Taught, about_a_pointer, pointer_scale, radius_of
 
@@ -32,7 +33,7 @@ class Gauge(PanelObject):
         """Half width and half height, which are its radius."""
         return self.radius_m, self.radius_m
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
+    def envelope(self, shown: Shown | None = None) -> Envelope:
         """Return a flat box around the instrument."""
         return Envelope(half_m=self.half_footprint_m, height_m=max(self.depth_m, LEAST_HEIGHT_M))
 

@@ -61,7 +61,7 @@ class Handwheel(PanelObject):
         """Its rim's outer radius."""
         return self.radius_m + self.rim_m, self.radius_m + self.rim_m
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
+    def envelope(self, shown: Shown | None = None) -> Envelope:
         """Return a box around the wheel."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.height_m + self.rim_m)
 

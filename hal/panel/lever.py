@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face
-from hal.panel.goals import StateGoal
+from hal.panel.goals import Shown, StateGoal
 from hal.panel.parts import Positive, States, Vector2
 from hal.panel.questions import PLACES, Question, Taught
 
@@ -42,8 +42,9 @@ class Lever(PanelObject):
         """Half the sides of its hub; the bar may pass over lower parts."""
         return self.width_m / 2, self.width_m / 2
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
+    def envelope(self, shown: Shown | None = None) -> Envelope:
         """Return a box around all that it sweeps; at a known angle, around hub and bar only."""
+        angle_rad = None if shown is None else self.angle_of(shown)
         if angle_rad is None:
             return Envelope(half_m=self.half_footprint_m, height_m=self.height_m)
         along = self.length_m / 2

@@ -10,7 +10,7 @@ from pydantic import ValidationError, model_validator
 from hal.panel.angles import fault
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face
-from hal.panel.goals import NumberGoal
+from hal.panel.goals import GAUGE_SHARE, NumberGoal, Shown
 from hal.panel.parts import Positive, Scale, Vector2, Vector3
 from hal.panel.questions import ENDS, Question, Taught, ends_of
 from hal.panel.turn import Angle
@@ -75,11 +75,15 @@ class Slider(PanelObject):
         half_width, half_height = self.half_footprint_m
         return Face(half_width_m=half_width, half_height_m=half_height, height_m=self.cap_size_m[2])
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """Return a box along the track."""
+    def envelope(self, shown: Shown | None = None) -> Envelope:
+        """Return a box along the track; at a known value, around the cap where that may be."""
         along, across, out = self.cap_size_m
-        half = ((self.travel_m + along) / 2, across / 2)
-        return Envelope(half_m=half, height_m=out, turn_rad=self.angle_rad)
+        if shown is None or shown.value is None:
+            half = ((self.travel_m + along) / 2, across / 2)
+            return Envelope(half_m=half, height_m=out, turn_rad=self.angle_rad)
+        half = (along / 2 + GAUGE_SHARE * self.travel_m, across / 2)
+        middle = (self.scale.place_of(shown.value), 0.0)
+        return Envelope(half_m=half, height_m=out, turn_rad=self.angle_rad, middle_m=middle)
 
     @property
     def goal(self) -> NumberGoal:

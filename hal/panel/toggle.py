@@ -7,10 +7,12 @@ from typing import Any, Literal
 
 from hal.panel.base import PanelObject
 from hal.panel.form import Envelope, Face
-from hal.panel.goals import StateGoal
+from hal.panel.goals import Shown, StateGoal
 from hal.panel.parts import Positive, Vector2
 from hal.panel.questions import Taught
 from hal.panel.turn import Tilt
+
+SIDES = {"on": 1.0, "off": -1.0}  # up and down
 
 
 class Toggle(PanelObject):
@@ -45,10 +47,14 @@ class Toggle(PanelObject):
         """The length of its bat, which is the room that a finger needs around it."""
         return self.bat_length_m, self.bat_length_m
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
-        """Return a box around the bat, which swings in the vertical plane."""
-        half = self.bat_length_m * math.sin(self.tilt_rad) + 2 * self.bat_radius_m
-        return Envelope(half_m=(2 * self.bat_radius_m, half), height_m=self.bat_length_m + self.bat_radius_m)
+    def envelope(self, shown: Shown | None = None) -> Envelope:
+        """Return a box around the bat, which swings in the vertical plane; in a known state, around its side only."""
+        foot, height = 2 * self.bat_radius_m, self.bat_length_m + self.bat_radius_m
+        reach = self.bat_length_m * math.sin(self.tilt_rad) + foot
+        side = SIDES.get(shown.state) if shown is not None and shown.state is not None else None
+        if side is None:
+            return Envelope(half_m=(foot, reach), height_m=height)
+        return Envelope(half_m=(foot, (reach + foot) / 2), height_m=height, middle_m=(0.0, side * (reach - foot) / 2))
 
     @property
     def goal(self) -> StateGoal:

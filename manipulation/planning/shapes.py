@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from scipy.spatial.transform import RigidTransform
 
 from hal.geometry import identity, transform_rpy
-from hal.panel import Panel, PanelObject
+from hal.panel import Panel, PanelObject, Shown
 
 Vector3 = tuple[float, float, float]
 
@@ -47,12 +47,11 @@ class CollisionBox:
         )
 
 
-def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> tuple[CollisionBox, ...]:
+def panel_boxes(panel: Panel, shown: Mapping[str, Shown] | None = None) -> tuple[CollisionBox, ...]:
     """Return the plate and the objects of a panel as boxes in the panel frame; the plate includes the wall around it.
 
     Args:
-        angles_rad: present angle (clockwise from up) of levers by name; a lever whose angle is unknown gets the box of
-            its whole sweep.
+        shown: present state of objects by name; a moving part whose place is not known gets the box of its whole way.
     """
     half_depth_m = max(panel.thickness_m, WALL_DEPTH_M) / 2
     plate = CollisionBox(
@@ -60,13 +59,13 @@ def panel_boxes(panel: Panel, angles_rad: Mapping[str, float] | None = None) -> 
         parent_from_box=transform_rpy((0.0, 0.0, -half_depth_m), (0.0, 0.0, 0.0)),
         half_m=(panel.width_m / 2 + WALL_BEYOND_M, panel.height_m / 2 + WALL_BEYOND_M, half_depth_m),
     )
-    known = angles_rad or {}
-    return (plate, *(envelope(panel_object, angle_rad=known.get(panel_object.name)) for panel_object in panel.objects))
+    known = shown or {}
+    return (plate, *(envelope(panel_object, known.get(panel_object.name)) for panel_object in panel.objects))
 
 
-def envelope(panel_object: PanelObject, *, angle_rad: float | None = None) -> CollisionBox:
-    """Return a box in the panel frame that holds the object in any state, or a smaller one for `angle_rad`."""
-    room = panel_object.envelope(angle_rad)
+def envelope(panel_object: PanelObject, shown: Shown | None = None) -> CollisionBox:
+    """Return a box in the panel frame that holds the object in any state, or a smaller one as it is `shown`."""
+    room = panel_object.envelope(shown)
     foot = transform_rpy((*panel_object.position_m, 0.0), (0.0, 0.0, room.turn_rad))
     return CollisionBox(
         name=panel_object.name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -12,7 +12,7 @@ from hal.arrays import Array
 from hal.errors import Unreachable
 from hal.geometry import UncertainPose, interpolate, transform
 from hal.motion import JointTrajectory, Mover
-from hal.panel import Panel
+from hal.panel import Panel, Shown
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.collision import CollisionModel, placed
 from manipulation.planning.hand import Hand
@@ -40,7 +40,7 @@ class SkillContext:
         base_from_panel: the panel's estimated pose with its covariance.
         flange_from_grip: pose of the finger tips on the flange, z along the fingers, x the closing direction.
         limits: speed of transfers.
-        angles_rad: present angles of levers, by name, for collision checks; the others block their whole sweep.
+        shown: present states of objects, by name, for collision checks; other moving parts block their whole way.
         park_rad: joints of the parking position.
         floor_z_m: height of the floor in the base frame.
         obstacles: further boxes in the base frame.
@@ -56,7 +56,7 @@ class SkillContext:
     limits: SpeedLimits
     park_rad: Array
     hand: Hand = field(default_factory=Hand)
-    angles_rad: Mapping[str, float] = field(default_factory=dict)
+    shown: Mapping[str, Shown] = field(default_factory=dict)
     floor_z_m: float = 0.0
     obstacles: tuple[CollisionBox, ...] = ()
     progress: Callable[[float, str], None] = _no_progress
@@ -77,13 +77,17 @@ class SkillContext:
         hand = self.hand.capsules(self.flange_from_grip, width_m)
         boxes = (
             floor_box(self.floor_z_m),
-            *placed(panel_boxes(self.panel, self.angles_rad), self.panel_pose),
+            *placed(panel_boxes(self.panel, self.shown), self.panel_pose),
             *self.obstacles,
         )
         ignored = [("", name) for name in may_touch]
         if near_plate:
             ignored += [(finger, "plate") for finger in FINGERS]
         return CollisionModel.build(self.kinematics, hand).with_boxes(boxes, ignored=ignored)
+
+    def forgetting(self, name: str) -> SkillContext:
+        """Return the context in which the place of an object's moving part is not known, because a hand has moved it."""
+        return replace(self, shown={known: shown for known, shown in self.shown.items() if known != name})
 
     def transfer(
         self, start_rad: Array, goal_rad: Array, *, width_m: float, name: str, effort: Effort = THOROUGH

@@ -16,7 +16,7 @@ from hal.arrays import Array
 from hal.errors import NoRoom, Unreachable
 from hal.geometry import certain, identity, matrix_of
 from hal.motion import DeclaredMotion, MotionReport, RobotState
-from hal.panel import NumberGoal, Panel, PanelObject
+from hal.panel import NumberGoal, Panel, PanelObject, Shown
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.clearance import segment_box
 from manipulation.planning.hand import Hand
@@ -93,8 +93,8 @@ class _Rehearsal(SkillContext):
         obstacles = [_Obstacle.of([panel_boxes(self.panel)[0]])]
         for one in self.panel.objects:
             if one.name not in may_touch:
-                angles = one.resting_angles.values() or (None,)
-                obstacles.append(_Obstacle.of([envelope(one, angle_rad=angle) for angle in angles]))
+                places: list[Shown | None] = [Shown(state=name) for name in one.resting_angles]
+                obstacles.append(_Obstacle.of([envelope(one, place) for place in places or [None]]))
         for poses in options:
             gaps = (gap for pose in poses for gap in _gaps(capsules, pose, obstacles))
             least = min(gaps, key=lambda gap: gap.free_m)

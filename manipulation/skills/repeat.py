@@ -47,7 +47,7 @@ def perform(
     outcome, cause, tries, is_met, was_missed = Outcome.UNREACHABLE, "", 0, False, False
     for tries in range(1, attempts + 1):
         context.progress((tries - 1) / attempts, f"{skill} {object_name}: attempt {tries}")
-        outcome, cause, reached = _try(attempt, stroke)
+        outcome, cause, reached = _try(attempt, stroke, object_name)
         context.progress((tries - 0.5) / attempts, f"{skill} {object_name}: {_next(attempt, outcome, cause, verify)}")
         if outcome is Outcome.UNREACHABLE:
             break
@@ -84,7 +84,7 @@ def _next(attempt: Attempt, outcome: Outcome, cause: str, verify: Verify | None)
     return "look again" if looks else cause
 
 
-def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:
+def _try(attempt: Attempt, stroke: Stroke, object_name: str) -> tuple[Outcome, str, float | None]:
     attempt.felt, attempt.is_against, attempt.cause = None, False, ENDED
     try:
         reached = stroke(attempt)
@@ -98,3 +98,5 @@ def _try(attempt: Attempt, stroke: Stroke) -> tuple[Outcome, str, float | None]:
     except MotionRefused as failure:
         retreat(attempt.context, attempt)
         return Outcome.UNREACHABLE, failure.what, None
+    finally:
+        attempt.context = attempt.context.forgetting(object_name)

@@ -61,8 +61,6 @@ def work(session: Session, body: ActionBody, *, verify: bool = True) -> Deed:
     if not report.is_done or eye.is_off_its_place or report.was_missed:
         report, found = _after_doubt(session, eye, panel_object, target, report)
         findings += found
-    if eye.last is None:
-        eye.forget()
     return Deed(
         action=ActionResult(
             object=panel_object.name,
@@ -115,7 +113,9 @@ def _operate(
     current = None if now is None else object_state(now, eye.witness)
     if current is not None:
         current = replace(current, turned_rad=session.world.turned_rad.get(panel_object.name))
-    report = operate(skill_context(session), panel_object, target, current=current, verify=eye.verify())
+    context = skill_context(session)
+    eye.forget()  # from now on the control may stand anywhere, also after a device that fails in the stroke
+    report = operate(context, panel_object, target, current=current, verify=eye.verify())
     if panel_object.turns_round and report.reached is not None:
         session.world.note_turned(panel_object.name, report.reached)
     return report
@@ -293,8 +293,6 @@ class _Eye:
 
 def object_state(reading: ObjectReading, panel_object: PanelObject) -> ObjectState:
     """Convert a reading to the object state that skills use."""
-    angle_rad = reading.value if panel_object.value_is_angle else None
-    if angle_rad is None and reading.state is not None:
-        angle_rad = panel_object.resting_angles.get(reading.state)
+    angle_rad = panel_object.angle_of(Shown(value=reading.value, state=reading.state))
     sigma = 0.0 if reading.uncertainty is None else reading.uncertainty
     return ObjectState(name=reading.name, state=reading.state, value=reading.value, angle_rad=angle_rad, sigma=sigma)

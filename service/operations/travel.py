@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from hal.devices import DeviceKind
 from hal.errors import MotionRefused, Unreachable
 from hal.geometry import transform_rpy
 from hal.motion import DeclaredMotion, JointTrajectory, MotionOutcome, MotionReport, RobotState
-from hal.panel import Panel, PanelObject
+from hal.panel import Panel, PanelObject, Shown
 from manipulation import (
     CollisionBox,
     Hand,
@@ -121,7 +121,11 @@ def skill_context(session: Session) -> SkillContext:
         limits=SpeedLimits(tip_m_per_s=file.safety.speed_limit_m_per_s),
         hand=Hand.of(file.hand),
         park_rad=np.array(file.workspace.park_rad),
-        angles_rad=lever_angles(session),
+        shown={
+            name: Shown(value=one.value, state=one.state)
+            for name, one in session.world.readings.items()
+            if one.answered
+        },
         floor_z_m=file.workspace.floor_z_m,
         obstacles=(session.world.obstacles or ())
         if session.world.base_from_panel is not None
@@ -140,20 +144,6 @@ def kinematics(session: Session) -> Kinematics:
             connection.cell.file.safety.joint_limits_rad,
         )
     )
-
-
-def lever_angles(session: Session) -> Mapping[str, float]:
-    """Return the angles of the levers and selectors that have been read: the angle itself, or that of the state."""
-    found: dict[str, float] = {}
-    for one in session.panel.objects:
-        reading, resting = session.world.readings.get(one.name), one.resting_angles
-        if reading is None or not reading.answered or not resting:
-            continue
-        if one.value_is_angle and reading.value is not None:
-            found[one.name] = reading.value
-        elif reading.state is not None and reading.state in resting:
-            found[one.name] = resting[reading.state]
-    return found
 
 
 def _where_the_panel_may_be(session: Session) -> CollisionBox:

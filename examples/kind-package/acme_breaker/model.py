@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from hal.panel import Envelope, Positive, Rectangular, StateGoal, Tilt
+from hal.panel import Envelope, Positive, Rectangular, Shown, StateGoal, Tilt
 
 
 class Breaker(Rectangular):
@@ -27,7 +27,7 @@ class Breaker(Rectangular):
         """Height above the plate of the handle's tip when it leans: the plane in which it is read."""
         return self.bat_length_m * math.cos(self.tilt_rad)
 
-    def envelope(self, angle_rad: float | None = None) -> Envelope:
+    def envelope(self, shown: Shown | None = None) -> Envelope:
         """Return a box over the housing, as high as a handle that stands straight out."""
         return Envelope(half_m=self.half_footprint_m, height_m=self.bat_length_m + 2 * self.bat_radius_m)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hal.errors import Cancelled, DeviceFault, InvalidRequest, Stopped, Unsupported
 from hal.geometry import certain, transform_rpy
 from hal.motion import DeclaredMotion, Hold, MotionLog, MotionOutcome, MotionReport, RobotState
-from hal.panel import Lamp
+from hal.panel import Lamp, Shown
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.attempt import Attempt
@@ -114,6 +114,18 @@ def test_a_look_that_denies_leads_to_another_try_and_at_most_three() -> None:
     assert deed(context(COMPLETED), lambda attempt: 1.0, [OFF, ON]).attempts == 2
     failed = deed(context(COMPLETED), lambda attempt: 1.0, [OFF, OFF, OFF])
     assert failed.outcome is Outcome.SLIPPED and failed.attempts == 3
+
+
+def test_transfers_after_a_stroke_avoid_every_place_where_the_part_may_stand_now() -> None:
+    known = []
+
+    def stroke(attempt: Attempt) -> float:
+        known.append(set(attempt.context.shown))
+        return 1.0
+
+    work = replace(context(COMPLETED), shown={"o": Shown(state="off"), "p": Shown(state="off")})
+    assert deed(work, stroke, [OFF, ON]).is_done
+    assert known == [{"o", "p"}, {"p"}]
 
 
 def test_a_look_that_may_err_confirms_only_what_it_would_confirm_two_sigmas_off() -> None:

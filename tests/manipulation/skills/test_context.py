@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.errors import Unreachable
 from hal.geometry import UncertainPose, certain, transform_rpy
 from hal.motion import DeclaredMotion, MotionReport, RobotState
+from hal.panel import Shown
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.hand import Hand
 from manipulation.planning.time_parameterization import SpeedLimits
@@ -47,7 +48,7 @@ def context(pose: RigidTransform = PANEL, uncertain: UncertainPose | None = None
         flange_from_grip=GRIP,
         limits=SpeedLimits(tip_m_per_s=0.25),
         park_rad=PARK,
-        angles_rad={"valve": 0.0},
+        shown={"valve": Shown(value=0.0)},
     )
 
 

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hal.errors import DeviceFault
 from hal.panel import Slider, load_panel
 from manipulation import Outcome, SkillReport
 from perception.vision.reading import ObjectReading
 from service.operations import manipulate
 from service.operations.locate import PanelShift
 from service.operations.manipulate import object_state
+from service.world_model import WorldModel
 
 PANEL = Path(__file__).parents[3] / "panels" / "bench.toml"
 
@@ -33,6 +35,24 @@ def test_the_skill_learns_how_sure_the_look_is() -> None:
     assert object_state(reading(0.3), panel_object).sigma == 0.3
     assert object_state(reading(None), panel_object).sigma == 0.0
     assert object_state(reading(0.3), panel_object).value == 71.1
+
+
+def test_a_control_is_not_known_any_more_once_a_stroke_began_that_a_fault_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The way to park would otherwise lead through the place to which a lever was half turned."""
+
+    def fail(*_: Any, **__: Any) -> SkillReport:
+        raise DeviceFault("wrist_ft silent", hint="none", device="wrist_ft")
+
+    slider: Any = load_panel(PANEL).object("setpoint")
+    session: Any = SimpleNamespace(panel=load_panel(PANEL), world=WorldModel())
+    session.world.note_readings([reading(0.3)])
+    monkeypatch.setattr(manipulate, "skill_context", lambda _: None)
+    monkeypatch.setattr(manipulate, "operate", fail)
+    with pytest.raises(DeviceFault):
+        manipulate._operate(session, manipulate._Eye(session, slider, True), slider, 70.0, reading(0.3))
+    assert "setpoint" not in session.world.readings
 
 
 @pytest.mark.parametrize(

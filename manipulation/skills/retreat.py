@@ -33,6 +33,7 @@ TURN_BACK_RAD = 0.3  # how far back along its own way the arm goes from what it 
 THIN_RAD = 0.01
 HELD_N = 10.0  # a hand that rests with more force on it is not free; weight and drift leave at most half of it
 HELD_NM = 0.4
+ACROSS_RATIO = 0.7  # of the force along the fingers: with less across them it is friction, and nothing hooks the hand
 INF = float("inf")
 # Soft across the fingers, so that a finger slides out of what hooks it and a wheel may turn with it.
 YIELDING = Compliance(
@@ -73,16 +74,21 @@ def retreat(context: SkillContext, attempt: Attempt | None = None, *, distance_m
     for number, pull_n in enumerate(PULL_N):
         # A gripper that fails, or has an implausible reading, does not end the retreat. Pads that move while the hand is
         # wedged wedge it more: a hand that is pressed from a side gives way first, and pulls once with the pads as they are.
-        was_pressed = _is_pressed(context)
+        was_pressed, is_pushed_out = _is_pressed(context), _is_pushed_out(context)
         with suppress(SkillFailure, MotionRefused):
-            _give_way(attempt)
+            if (
+                not is_pushed_out
+            ):  # what moves towards the hand goes on pushing while the arm gives way to nothing across
+                _give_way(attempt)
         with suppress(SkillFailure, MotionRefused, DeviceFault):
             if number > 1:
                 _loosen(attempt)
             elif number == 1 or not was_pressed:
                 _open(attempt)
         try:
-            pulled = _pull(attempt, distance_m, pull_n, slowly=number > 0 or _is_pressed(context))
+            pulled = _pull(
+                attempt, distance_m, pull_n, slowly=number > 0 or (not is_pushed_out and _is_pressed(context))
+            )
         except (SkillFailure, MotionRefused) as failure:
             cause = str(failure)
             continue
@@ -133,6 +139,15 @@ def _is_pressed(context: SkillContext) -> bool:
     wrench = context.mover.state().wrench
     along = context.flange_from_grip.rotation.apply([0.0, 0.0, 1.0])
     return float(np.linalg.norm(wrench[:3])) >= HELD_N or abs(float(wrench[3:] @ along)) >= HELD_NM
+
+
+def _is_pushed_out(context: SkillContext) -> bool:
+    """Return whether something pushes the hand back along its fingers, with little across them: a door that swings, say."""
+    wrench = context.mover.state().wrench
+    along = context.flange_from_grip.rotation.apply([0.0, 0.0, 1.0])
+    out_n = -float(wrench[:3] @ along)
+    across_n = float(np.linalg.norm(wrench[:3] + out_n * along))
+    return out_n >= HELD_N and across_n < ACROSS_RATIO * out_n
 
 
 def _open(attempt: Attempt) -> None:

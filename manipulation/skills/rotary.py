@@ -33,6 +33,9 @@ RESISTS_RATIO, SNAP_RATIO = (
 )  # of the largest torque: above the first a detent resists, below the second it was passed
 LEAST_NM = 0.03
 STOP_N = 40.0
+# Twice the torque of the heaviest selectors. Against a blocked one the fingers roll off the bar at 0.8 N m, and are wedged
+# with up to 180 N.
+STOP_NM = 0.65
 TOLERANCE_RAD = np.radians(12.0)
 INF = float("inf")
 # A heavy virtual mass prevents chatter (15 to 28 N from tick to tick with 8 kg, 4 to 6 N with 200 kg). Along the fingers
@@ -140,7 +143,8 @@ def turn_bar(
     attempt.leave(STANDOFF_M + selector.height_m - seat)
     reached = start_rad + sign * turned
     if end.tripped is not None:
-        raise SkillFailure(Outcome.STALLED, f"it stopped against {end.peak_force_n:.0f} N", reached=reached)
+        against = f"{abs(end.wrench[5]):.1f} N m" if end.tripped == "torque" else f"{end.peak_force_n:.0f} N"
+        raise SkillFailure(Outcome.STALLED, f"it does not turn on against {against}", reached=reached)
     passed = detents_passed(felt)
     if passed < detents:
         what = f"{passed} of {detents} detents were felt while the hand turned all the way at {grip_n:.0f} N"
@@ -170,8 +174,11 @@ def _hold(
 def _turn(attempt: Attempt, start: RigidTransform, angle_rad: float) -> MotionReport:
     axis = attempt.context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
     poses = arc(start, centre_m=start.translation, axis=axis, angle_rad=angle_rad)
-    guard = Guard(name="effort", quantity=Quantity.FORCE, limit=STOP_N)
-    return attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=(guard,), compliance=YIELDING)
+    guards = (
+        Guard(name="effort", quantity=Quantity.FORCE, limit=STOP_N),
+        *(Guard(name="torque", quantity=Quantity.TORQUE, limit=STOP_NM, axis=(0.0, 0.0, side)) for side in (-1.0, 1.0)),
+    )
+    return attempt.along(poses, name="turn", speed_m_per_s=TURN_M_PER_S, guards=guards, compliance=YIELDING)
 
 
 def _felt(reports: list[MotionReport], sign: float) -> Array:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hal.errors import Cancelled, DeviceFault, InvalidRequest, Stopped, Unsupported
 from hal.geometry import certain, transform_rpy
-from hal.motion import DeclaredMotion, Hold, MotionLog, MotionOutcome, MotionReport, RobotState
+from hal.motion import DeclaredMotion, Hold, MotionLog, MotionOutcome, MotionReport, Quantity, RobotState
 from hal.panel import Lamp, Shown
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.time_parameterization import SpeedLimits
@@ -22,6 +22,8 @@ from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, surely_within, wrapped
 from manipulation.skills.probe import contact_of
 from manipulation.skills.repeat import perform
+from manipulation.skills.retreat import retreat
+from manipulation.skills.rotary import _turn
 from tests.manipulation.arms import T3
 from tests.manipulation.planning.test_collision import make_panel
 from tests.manipulation.rig import HOME
@@ -161,6 +163,27 @@ def test_a_failure_retreats_and_keeps_its_name_when_the_look_agrees() -> None:
     result = deed(work, miss, [OFF, OFF, OFF])
     assert result.outcome is Outcome.MISSED and result.attempts == 3
     assert work.mover.asked.count("retreat") == 3
+
+
+def test_a_turn_of_a_selector_ends_by_its_torque_in_either_direction() -> None:
+    """Drill 20608: fingers that turned on about a blocked bar rolled off it, and were wedged with 182 N."""
+    work, turns = context(COMPLETED), []
+    work.mover.execute = lambda motion: turns.append(motion) or COMPLETED  # type: ignore[method-assign]
+    _turn(Attempt(work), AT_HOME, 0.5)
+    axes = {guard.axis for guard in turns[0].guards if guard.quantity is Quantity.TORQUE and guard.limit < 0.8}
+    assert axes == {(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)}
+
+
+@pytest.mark.parametrize(
+    ("force_n", "first"), [((3.0, 4.0, -40.0), "retreat"), ((30.0, 0.0, -40.0), "give way"), ((0, 0, 40.0), "give way")]
+)
+def test_a_hand_that_is_pushed_back_goes_back_at_once(force_n: tuple[float, float, float], first: str) -> None:
+    """Drill 20763: a door swung towards the hand, which gave way across its fingers only, up to 111 N."""
+    work = context(COMPLETED)
+    pressed = replace(work.mover.state(), wrench=np.array([*force_n, 0.0, 0.0, 0.0]))
+    work.mover.state = lambda: pressed  # type: ignore[method-assign]
+    retreat(work)
+    assert work.mover.asked[0] == first
 
 
 def test_a_failed_stroke_that_did_the_deed_is_done() -> None:

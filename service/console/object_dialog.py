@@ -229,7 +229,8 @@ def history_html(one: PanelObject, readings: list[Reading]) -> str:
         if row["crop_url"]
     ]
     pictures = f'<h2>{say("object.pictures")}</h2><div class="crops">{"".join(crops)}</div>' if crops else ""
-    return f"<h2>{say('object.history')}</h2>{_trend(one, readings)}{pictures}"
+    more = f'<p><a href="/history?object={one.name}">{say("history.more")}</a></p>'
+    return f"<h2>{say('object.history')}</h2>{_trend(one, readings)}{more}{pictures}"
 
 
 def _trend(one: PanelObject, readings: list[Reading]) -> str:

@@ -20,6 +20,7 @@ PAGES = {
     "panel": "/",
     "missions": "/missions",
     "alarms": "/alarms",
+    "history": "/history",
     "devices": "/devices",
     "setup": "/setup",
     "cell": "/cell",

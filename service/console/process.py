@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from service.console import alarms_page, cell_page, devices_page, missions_page, panel_page, setup_page
+from service.console import alarms_page, cell_page, devices_page, history_page, missions_page, panel_page, setup_page
 from service.console.mirror import Mirror
 from service.console.own_page import OwnPageOnly
 from service.console.page_frame import Place
@@ -25,7 +25,7 @@ from service.console.texts import say
 from service.processes.child import Lifeline
 
 WEB = Path(__file__).parent / "web"
-PAGES = (panel_page, missions_page, alarms_page, devices_page, setup_page, cell_page)
+PAGES = (panel_page, missions_page, alarms_page, history_page, devices_page, setup_page, cell_page)
 
 
 def create_app(client: ServiceClient, *, port: int, stop_port: int, ready: threading.Event | None = None) -> FastAPI:

@@ -37,7 +37,7 @@ limits = { high = 90.0 }
 what_to_do = "slide it back"
 scale = { minimum = 0.0, maximum = 100.0, unit = "%", at_min = -0.05, at_max = 0.05 }
 """
-PAGES = ("/", "/missions", "/alarms", "/devices", "/setup", "/cell")
+PAGES = ("/", "/missions", "/alarms", "/history", "/devices", "/setup", "/cell")
 
 
 def until(page: Any, claim: str) -> None:
@@ -210,6 +210,21 @@ def test_an_alarm_is_acknowledged_and_shelved_with_a_reason(page: Any, cell: Cel
     shelved = next(one for one in cell.service.service.plant.alarms.all() if one.id == "setpoint.high")
     assert (str(shelved.state), shelved.by, shelved.reason) == ("shelved", "alice", "test run")
     assert 7.9 * 3600 < (shelved.shelved_until_s or 0.0) - time.time() < 8.1 * 3600
+
+
+def test_a_point_of_the_trend_shows_its_reading_and_reports_are_searched(page: Any, cell: Cell) -> None:
+    cell.record(33.5)
+    page.goto(f"{cell.url}/history?object=setpoint")
+    until(page, "document.querySelector('tbody').textContent.includes('33.5 %')")
+    chart = "getElement(Number(document.querySelector('.nicegui-echart').id.slice(1))).chart"
+    until(page, f"{chart}.getOption().series[2].data.at(-1)[1] === 33.5")
+    x, y = page.evaluate(f"{chart}.convertToPixel({{seriesIndex: 2}}, {chart}.getOption().series[2].data.at(-1))")
+    page.click(".nicegui-echart", position={"x": x, "y": y})
+    until(page, "document.querySelector('.main').textContent.includes(': 33.5')")
+    leave_mission(cell.service.service.runs_dir / "20260102T000000-a", done=["read", "feel"])
+    until(page, "document.querySelector('.main').textContent.includes('1 of 1 reports')")
+    page.fill("input[aria-label=Object]", "nothing of that name")
+    until(page, "document.querySelector('.main').textContent.includes('0 of 1 reports')")
 
 
 def test_a_mission_is_chosen_planned_and_taken_up_where_it_ended(page: Any, cell: Cell) -> None:

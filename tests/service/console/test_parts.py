@@ -18,9 +18,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.panel import NumberGoal, Panel, load_panel
+from hal.panel.limits import Limits
 from manipulation import Kinematics
 from service.console.cell_page import joint_frames
 from service.console.devices_page import shown_value
+from service.console.history_page import fits
 from service.console.mirror import Mirror
 from service.console.mission_words import did, step_list
 from service.console.missions_page import plan_table
@@ -31,6 +33,7 @@ from service.console.relay import PICTURES
 from service.console.service_client import ServiceClient
 from service.console.setup_page import checks
 from service.console.texts import ENGLISH
+from service.console.trend_chart import of_buckets, of_readings, options_of
 from service.console.values import limits_for_people, shown, sigma, target_for_api
 from service.jsonable import jsonable
 from service.schema.mission_file import MissionFile
@@ -54,8 +57,6 @@ def reading(name: str, **given: Any) -> dict[str, Any]:
 def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
     told = ""
     for file in sorted((ROOT / "service/console").glob("*.py")):
-        if file.name == "texts.py":
-            continue
         tree = ast.parse(file.read_text(encoding="utf-8"))
         told += "\n" + "\n".join(
             node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
@@ -67,21 +68,10 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
                 and isinstance(node.args[0], ast.Constant)
             ):
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
-    built = (
-        "nav.",
-        "mode.",
-        "state.",
-        "verb.",
-        "column.",
-        "stop.",
-        "step.",
-        "did.",
-        "plan.station.",
-        "alarm",
-        "alarms.do.",
-        "alarms.ask.",
-        "alarms.confirm.",
-    )  # put together
+    groups = "nav mode state verb column stop step did plan.station alarm alarms.do alarms.ask alarms.confirm"
+    built = tuple(
+        f"{group}." for group in f"{groups} history.span history.outcome".split()
+    )  # keys that are put together
     unused = [key for key in ENGLISH if not key.startswith(built) and not re.search(rf"(?m)^{re.escape(key)}$", told)]
     assert unused == []
 
@@ -231,6 +221,53 @@ def test_values_of_devices_have_units_and_names() -> None:
     assert shown_value("lights", [True, False]) == "lights on off"
     assert shown_value("gripper", {"width_m": 0.04, "is_moving": False}) == "width 0.04 m, moving no"
     assert shown_value("force_torque", {"force_n": [1.0, 2.5, 0.0]}) == "force 1 2.5 0 N"
+
+
+def test_a_trend_has_its_band_in_the_words_of_the_object_and_no_refused_reading(panel: Panel) -> None:
+    limited = panel.object("pressure").model_copy(update={"limits": Limits(low=1.0, high=6.0, high_high=8.0)})
+    readings = [
+        reading("pressure", value=4.0, sigma=0.5, utc_s=10.0),
+        reading("pressure", quality="invalid", cause="glare", utc_s=11.0),
+        reading("pressure", value=5.0, sigma=None, utc_s=12.0),
+    ]
+    bypass = of_readings(panel.object("bypass"), [reading("bypass", value=math.pi / 2, utc_s=10.0)])
+    chart = options_of([of_readings(limited, readings), bypass])
+    lower, band, line = chart["series"][:3]
+    assert line["data"] == [[10_000.0, 4.0], [12_000.0, 5.0]]
+    assert lower["data"][0][1] == pytest.approx(4.0 - 1.96 * 0.5)
+    assert band["data"][0][1] == pytest.approx(2 * 1.96 * 0.5)
+    assert [mark["yAxis"] for mark in line["markLine"]["data"]] == [1.0, 6.0, 8.0]
+    assert [axis["name"] for axis in chart["yAxis"]] == ["bar", "°"]
+    assert chart["yAxis"][0]["min"] < 1.0
+    assert 6.0 < chart["yAxis"][0]["max"] < 8.0, "the axis reaches the nearest limits, and no others"
+    assert chart["series"][5]["yAxisIndex"] == 1
+    assert chart["series"][5]["data"] == [[10_000.0, 90.0]]
+
+
+def test_a_span_of_time_is_a_point_from_its_least_to_its_greatest_value(panel: Panel) -> None:
+    span = {"since_s": 0.0, "until_s": 10.0, "minimum": 1.0, "mean": 2.0, "maximum": 4.0}
+    trend = of_buckets(panel.object("pressure"), [span, {**span, "minimum": None, "mean": None, "maximum": None}])
+    assert [(one.at_s, one.low, one.value, one.high) for one in trend.points] == [(5.0, 1.0, 2.0, 4.0)]
+
+
+@pytest.mark.parametrize(
+    ("asked", "is_found"),
+    [
+        ({}, True),
+        ({"wanted": "PRESS"}, True),
+        ({"wanted": "druck"}, True),
+        ({"wanted": "flow"}, False),
+        ({"outcome": "failed"}, True),
+        ({"outcome": "succeeded"}, False),
+        ({"since": "2026-01-04"}, False),
+        ({"since": "2026-01-01", "until": "2026-01-05"}, True),
+        ({"until": "2026-01-01"}, False),
+    ],
+)
+def test_reports_are_found_by_object_outcome_and_day(asked: dict[str, str], is_found: bool) -> None:
+    mission = {"objects": ["pressure"], "succeeded": False, "started": "2026-01-03T12:00:00Z"}
+    usual = {"wanted": "", "outcome": "any", "since": "", "until": ""}
+    assert fits(mission, labels={"pressure": "Druck"}, **{**usual, **asked}) is is_found
 
 
 def test_the_set_up_names_what_is_missing_and_the_one_next_step() -> None:

@@ -123,8 +123,9 @@ class Panelwright:
                 console,
                 service_url=self.url,
                 stop_port=self.stop_port,
+                cookie=self._cookie,
                 report=self.service.note,
-                keep=self.service.lease.subs.all_kept,
+                keep=self.service.lease.subs.kept_of_console,
             )
 
         self.gateway = self._gateway_host(cell, options)
@@ -133,6 +134,11 @@ class Panelwright:
     def url(self) -> str:
         """Address of the HTTP server."""
         return self._exposure.url(self.port)
+
+    @property
+    def _cookie(self) -> str:
+        """Name of the cookie of a browser's session, which differs between services of one machine."""
+        return f"panelwright_{self.port}"
 
     @property
     def stop_url(self) -> str:
@@ -228,8 +234,9 @@ class Panelwright:
             self.service,
             allowed=allowed,
             stop_url=stop_url,
-            cookie=f"panelwright_{self.port}",
+            cookie=self._cookie,
             console_url=self.console_url,
+            console_secret=None if self.console is None else self.console.secret,
             is_loaded=self.is_loaded.is_set,
         )
 
@@ -297,9 +304,8 @@ class Panelwright:
 
 
 def is_open_here(options: Options) -> bool:
-    """Return whether the console may be started: it cannot log in yet, so it serves this machine, and only without keys."""
-    exposure = options.exposure
-    return exposure.is_local and exposure.tls_cert is None and book_of(options.runs_dir).is_open
+    """Return whether the console may be started: it has no TLS, so it serves this machine only."""
+    return options.exposure.is_local and options.exposure.tls_cert is None
 
 
 def _console_listener(options: Options, port: int) -> socket.socket:

@@ -156,7 +156,7 @@ def _announce(panelwright: Panelwright, wants_console: bool) -> None:
         if panelwright.console_url is not None:
             console.print(f"panelwright: console at [bold]{panelwright.console_url}[/]")
         elif wants_console:
-            console.print("panelwright: without the console, which cannot log in with a key yet; use the page instead")
+            console.print("panelwright: without the console, which serves this machine only and without TLS")
 
 
 def announcement(service: Service, url: str, stop_url: str) -> Iterator[str]:

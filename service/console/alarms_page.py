@@ -7,6 +7,7 @@ from typing import Any
 
 from nicegui import ui
 
+from service.access.keys import Role
 from service.console.mirror import Mirror
 from service.console.mission_words import name_of
 from service.console.page_frame import Place, attempt, button, clock, live, page_frame, picks, table
@@ -23,6 +24,7 @@ DEEDS = {
     "shelved": ("unshelve", "out-of-service"),
     "out-of-service": ("in-service",),
 }
+MAINTAINERS = ("out-of-service", "in-service")
 ASKS_WHY = ("shelve", "out-of-service")
 
 
@@ -62,6 +64,7 @@ def _row(alarm: dict[str, Any], mirror: Mirror) -> str:
         f'aria-label="{attribute(say(f"alarms.do.{deed}"))} {attribute(label)} {attribute(alarm["kind"])}">'
         f"{attribute(say(f'alarms.do.{deed}'))}</button> "
         for deed in DEEDS.get(alarm["state"], ())
+        if mirror.may(Role.MAINTAINER if deed in MAINTAINERS else Role.OPERATOR)
     )
     is_told = alarm["reason"] in ("", alarm["says"])
     last = alarm["by"] if is_told else say("alarms.by", by=alarm["by"], reason=alarm["reason"])
@@ -87,7 +90,7 @@ class _Desk:
 
     def __init__(self, mirror: Mirror) -> None:
         self._mirror = mirror
-        self._you = ui.input(label=say("alarms.you")).props("outlined dense maxlength=80").style("max-width:20rem")
+        self._you = you_field(mirror)
         self._dialog = ui.dialog().props("no-esc-dismiss")  # the Esc key is the stop
         with self._dialog, ui.card().classes("dialog"):
             self._asked = ui.element("div")
@@ -128,6 +131,13 @@ class _Desk:
             return
         await attempt(lambda: self._mirror.client.post(f"/v1/alarms/{alarm}/{deed}", {"by": who, **body}))
         self._mirror.hurry()
+
+
+def you_field(mirror: Mirror) -> Any:
+    """Return the field for the name under which something is recorded; who is logged in has a name, and gives none."""
+    field = ui.input(label=say("alarms.you"), value=mirror.person.name).props("outlined dense maxlength=80")
+    field.set_visibility(mirror.person.name is None)
+    return field.style("max-width:20rem")
 
 
 def _hours() -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from hal.errors import CellError
+from service.access.keys import Role
 from service.console.mirror import Mirror
 from service.console.page_frame import Place, attempt, live, page_frame, picks, table
 from service.console.service_client import QUICK_S
@@ -83,7 +84,7 @@ class _Values:
         quality = say("device.good") if is_good else health["quality"] if health["connected"] else say("device.gone")
         fault = health["detail"] or ("" if health["cause"] == "none" else health["cause"])
         counts = say("device.errors", errors=health["errors"], reconnects=health["reconnects"])
-        again = "" if health["connected"] else (
+        again = "" if health["connected"] or not self._mirror.may(Role.OPERATOR) else (
             f'<button type="button" class="plain" data-connect="{name}">{say("device.connect")}</button>'
         )  # fmt: skip
         value = "–" if reading is None else shown_value(device["kind"], reading["value"])

@@ -5,39 +5,58 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from dataclasses import dataclass
 from typing import Any
 
 from hal.errors import CellError
 from hal.panel import Panel
-from service.client import FINAL
+from service.access.keys import Role
+from service.client import FINAL, ApiError
 from service.console.service_client import QUICK_S, ServiceClient
 
 TICK_S = 0.25
-IDLE_S = 15.0  # nobody has looked for so long: ask less
+IDLE_S = 15.0  # nobody has looked for so long: do not ask
+LEFT_S = 600.0  # nobody has looked for so long: whoever looked has left
 PERIODS_S = {
     "ready": 1.0, "tasks": 0.5, "history": 1.0, "alarms": 1.0, "devices": 2.0, "frames": 1.0, "lease": 2.0,
-    "stop": 1.0, "missions": 5.0, "mission_files": 10.0,
+    "stop": 1.0, "missions": 5.0, "mission_files": 10.0, "rounds": 2.0, "review": 2.0,
     "calibrations": 10.0, "info": 10.0, "panel": 10.0, "arm": 0.25, "arm_model": 30.0,
 }  # fmt: skip
 PATHS = {
     "ready": "/readyz", "tasks": "/v1/tasks?limit=30", "history": "/v1/history", "alarms": "/v1/alarms",
     "devices": "/v1/devices", "frames": "/v1/frames", "lease": "/v1/lease", "stop": "/v1/stop", "missions": "/v1/missions",
-    "mission_files": "/v1/mission-files",
+    "mission_files": "/v1/mission-files", "rounds": "/v1/rounds", "review": "/v1/review?limit=100",
     "calibrations": "/v1/calibrations", "info": "/v1/info", "panel": "/v1/panel",
 }  # fmt: skip
-ON_DEMAND = ("arm", "arm_model", "mission_files")
+UNAUTHENTICATED = 401
+ON_DEMAND = ("arm", "arm_model", "mission_files", "rounds", "review")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Person:
+    """Who looks; `name` is that of the key, None while the service has no keys."""
+
+    name: str | None
+    role: Role
+
+
+ANYBODY = Person(name=None, role=Role.MAINTAINER)
 
 
 class Mirror:
-    """What the service said last, by topic, and the events of the tasks that run. It can be thrown away at any time.
+    """What the service said last to one person, by topic, and the events of the tasks that run.
+
+    It can be thrown away at any time.
 
     Attributes:
+        person: in whose session the client asks; the service decides what this person may do, and pages offer no more.
         problem: why the service could not be asked; None when it answers.
         events: events of a task by its id, from its beginning.
     """
 
-    def __init__(self, client: ServiceClient) -> None:
+    def __init__(self, client: ServiceClient, *, person: Person = ANYBODY) -> None:
         self.client = client
+        self.person = person
         self.problem: CellError | None = None
         self.events: dict[str, list[dict[str, Any]]] = {}
         self._said: dict[str, Any] = {}
@@ -53,12 +72,26 @@ class Mirror:
         """Begin to ask, in the running event loop."""
         self._loop = asyncio.create_task(self._run())
 
-    async def close(self) -> None:
+    def close(self) -> None:
         """End all requests."""
         for task in [self._loop, *self._followers.values(), *self._asking]:
             if task is not None:
                 task.cancel()
-        await self.client.close()
+
+    def may(self, needed: Role) -> bool:
+        """Return whether the role of the person permits what needs this role."""
+        return self.person.role.permits(needed)
+
+    @property
+    def is_left(self) -> bool:
+        """Whether nobody has looked for a long time, and no task needs to be followed."""
+        is_following = any(not one.done() for one in self._followers.values())
+        return not is_following and time.monotonic() - self._looked_s > LEFT_S
+
+    @property
+    def must_log_in(self) -> bool:
+        """Whether the session has ended."""
+        return isinstance(self.problem, ApiError) and self.problem.problem.get("status") == UNAUTHENTICATED
 
     def said(self, topic: str, otherwise: Any = None) -> Any:
         """Return the newest answer of a topic; a topic that only some pages need is asked for while they do."""
@@ -106,7 +139,7 @@ class Mirror:
     async def _run(self) -> None:
         while True:
             now_s = time.monotonic()
-            if now_s - self._looked_s < IDLE_S or self.problem is not None or "info" not in self._said:
+            if now_s - self._looked_s < IDLE_S:
                 for topic in self._topics_due(now_s):
                     self._due_s[topic] = now_s + QUICK_S + 1.0  # not again before it has answered
                     task = asyncio.create_task(self._ask(topic))
@@ -129,6 +162,8 @@ class Mirror:
         except CellError as error:
             if topic in ("info", "ready"):  # a single topic may be refused, for example an arm that is missing
                 self.problem = error
+                if self.must_log_in:
+                    self._said.clear()
         finally:
             self._due_s[topic] = time.monotonic() + PERIODS_S[topic]
         if topic == "tasks":
@@ -142,7 +177,7 @@ class Mirror:
         return f"/v1/devices/{arm}/reading?max_age_s=0.1" if topic == "arm" else f"/v1/devices/{arm}"
 
     def _follow_active(self) -> None:
-        for task in self._said["tasks"]["tasks"][:5]:
+        for task in self._said.get("tasks", {"tasks": []})["tasks"][:5]:
             if task["id"] not in self.events:
                 self.events[task["id"]] = []
                 self._followers[task["id"]] = asyncio.create_task(self._follow(task["id"]))

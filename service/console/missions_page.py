@@ -9,6 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from hal.panel import Panel
+from service.access.keys import Role
 from service.client import FINAL
 from service.console.mirror import Mirror
 from service.console.mission_words import did, is_plan, lasting, step_list
@@ -36,9 +37,13 @@ def install(place: Place) -> None:
                 choices.props(f'role=group aria-label="{say("missions.choose")}"')
                 live(choices, desk.choices)
                 live(ui.html("", sanitize=False), desk.steps)
-                with ui.element("div").classes("row").style("margin-top:.6rem"):
-                    start = button(say("missions.run"), desk.run)
-                    dry = button(say("missions.plan"), desk.plan, look="plain")
+                starts = []
+                if mirror.may(Role.OPERATOR):
+                    with ui.element("div").classes("row").style("margin-top:.6rem"):
+                        starts = [
+                            button(say("missions.run"), desk.run),
+                            button(say("missions.plan"), desk.plan, look="plain"),
+                        ]
                 ui.html(say("missions.says"), sanitize=False, tag="p").classes("quiet")
                 live(ui.html("", sanitize=False).props("role=status"), desk.planned)
             with ui.element("section").classes("card half"):
@@ -55,8 +60,8 @@ def install(place: Place) -> None:
                 live(ui.html("", sanitize=False), lambda: _tasks(mirror))
 
             def enable() -> None:
-                is_busy, may_run = mirror.active is not None, desk.can_run
-                for one, is_on in ((start, may_run and not is_busy), (dry, may_run and not is_busy), (end, is_busy)):
+                is_busy = mirror.active is not None
+                for one, is_on in [*((start, desk.can_run and not is_busy) for start in starts), (end, is_busy)]:
                     if is_on is bool(one.props.get("disabled")):
                         one.props(remove="disabled") if is_on else one.props("disabled")
 
@@ -209,7 +214,8 @@ def steps(mirror: Mirror) -> str:
 
 
 def _reports(mirror: Mirror) -> str:
-    rows = [report_row(mission, can_resume=mirror.active is None) for mission in _earlier(mirror)[:10]]
+    can_resume = mirror.active is None and mirror.may(Role.OPERATOR)
+    rows = [report_row(mission, can_resume=can_resume) for mission in _earlier(mirror)[:10]]
     return table(REPORT_COLUMNS, rows, name=say("missions.reports"), empty=say("missions.no_reports"))
 
 

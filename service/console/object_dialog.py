@@ -9,6 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from hal.panel import NumberGoal, PanelObject, StateGoal
+from service.access.keys import Role
 from service.client import FINAL
 from service.console.mirror import Mirror
 from service.console.page_frame import attempt, button, clock
@@ -86,6 +87,11 @@ class ObjectDialog:
         assert one is not None  # noqa: S101 - narrowing: `show` checked it
         self._work.clear()
         with self._work:
+            if not self._mirror.may(Role.OPERATOR):
+                ui.html(attribute(say("object.look_only", label=label_of(one))), sanitize=False, tag="p").classes(
+                    "quiet"
+                )
+                return
             ui.html(attribute(say("object.read_says", label=label_of(one))), sanitize=False, tag="p").classes("quiet")
             with ui.element("div").classes("row"):
                 button(say("object.read"), self._read)

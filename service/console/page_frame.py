@@ -12,14 +12,17 @@ from typing import Any
 from nicegui import ui
 
 from hal.errors import CellError
-from service.console.mirror import Mirror
+from service.access.keys import Role
+from service.console.mirror import Mirror, Person
 from service.console.texts import say, word
 from service.console.values import STALE_S, attribute
 
-PAGES = {
+PATHS = {
     "panel": "/",
     "missions": "/missions",
+    "rounds": "/rounds",
     "alarms": "/alarms",
+    "review": "/review",
     "history": "/history",
     "devices": "/devices",
     "setup": "/setup",
@@ -35,33 +38,39 @@ PICK = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """What the pages need: the mirror of the service, and the console's own port and the stop port."""
+    """What the pages need: the console's own port and the stop port, and the mirror of whoever asks for the page."""
 
-    mirror: Mirror
     port: int
     stop_port: int
+
+    @property
+    def mirror(self) -> Mirror:
+        """The mirror of the person whose page is being built."""
+        mirror: Mirror = ui.context.client.request.state.mirror
+        return mirror
 
 
 @contextmanager
 def page_frame(place: Place, current: str) -> Iterator[None]:
     """Lay out one page: what is built inside becomes its main part."""
+    mirror = place.mirror
     ui.add_head_html('<link rel="stylesheet" href="/web/console.css">')
-    ui.add_body_html(stop_box(place))
+    ui.add_body_html(stop_box(place, may_reset=mirror.may(Role.OPERATOR)))
     with ui.element("div").classes("top"):
         heading = ui.html("", sanitize=False)
         links = "".join(
             f'<a href="{path}"{" aria-current=page" if name == current else ""}>{say(f"nav.{name}")}</a>'
-            for name, path in PAGES.items()
+            for name, path in PATHS.items()
         )
         ui.html(links, sanitize=False, tag="nav").props(f'aria-label="{say("nav")}"')
     with ui.element("div").classes("main"):  # NiceGUI lays it out inside of its own <main>
         banner = ui.html("", sanitize=False).classes("banner").props("role=alert")
         yield
-    live(heading, lambda: _heading(place.mirror))
-    live(banner, lambda: trouble(place.mirror))
+    live(heading, lambda: _heading(mirror))
+    live(banner, lambda: trouble(mirror))
 
 
-def stop_box(place: Place) -> str:
+def stop_box(place: Place, *, may_reset: bool) -> str:
     """Return the stop's own HTML and script, which need nothing of the console once they are loaded."""
     words = {key: say(f"stop.{key}") for key in ("stopping", "stopped", "clear", "silent")}
     return (
@@ -69,7 +78,7 @@ def stop_box(place: Place) -> str:
         f'data-stop-port="{place.stop_port}" data-utc="{time.time():.2f}" data-stale-s="{STALE_S:.0f}" '
         f'data-words="{attribute(json.dumps(words))}">'
         f'<p id="stop-line" role="status">{say("stop.unknown")}</p>'
-        f'<button id="stop-reset" type="button" hidden>{say("stop.reset")}</button>'
+        f'<button id="stop-reset" type="button" data-may="{"yes" if may_reset else "no"}" hidden>{say("stop.reset")}</button>'
         f'<button id="stop-button" type="button" title="{attribute(say("stop.title"))}">{say("stop.label")}</button></aside>'
         '<script src="/web/stop.js"></script><script src="/web/page.js"></script>'
     )
@@ -115,6 +124,8 @@ async def attempt(deed: Callable[[], Awaitable[Any]]) -> Any:
 
 def trouble(mirror: Mirror) -> str:
     """Return what keeps the cell from working, as HTML; empty if nothing does."""
+    if mirror.must_log_in:
+        return f'{attribute(say("session.ended"))} <a href="/login.html">{attribute(say("session.log_in"))}</a>'
     if mirror.problem is not None:
         return attribute(f"{mirror.problem.what}: {mirror.problem.hint}")
     ready, lines = mirror.said("ready"), []
@@ -159,4 +170,12 @@ def _heading(mirror: Mirror) -> str:
     line = say("cell.unknown")
     if info is not None:
         line = say("cell", cell=info["cell"], mode=word("mode", info["mode"]), panel=info["panel"])
-    return f'<h1>panelwright</h1><span class="quiet">{attribute(line)}</span>'
+    return f'<h1>panelwright</h1><span class="quiet">{attribute(line)}</span>{_person(mirror.person)}'
+
+
+def _person(person: Person) -> str:
+    """Return who is logged in, with the way out; empty while the service has no keys."""
+    if person.name is None:
+        return ""
+    told = attribute(say("person", name=person.name, role=word("role", person.role)))
+    return f'<p class="quiet" id="person">{told} <button type="button" class="plain" id="log-out">{say("log_out")}</button></p>'

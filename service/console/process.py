@@ -15,42 +15,64 @@ from fastapi import FastAPI
 from nicegui import app as nicegui_app
 from nicegui import ui
 
-from service.console import alarms_page, cell_page, devices_page, history_page, missions_page, panel_page, setup_page
-from service.console.mirror import Mirror
+from service.console import (
+    alarms_page,
+    cell_page,
+    devices_page,
+    history_page,
+    missions_page,
+    panel_page,
+    review_page,
+    rounds_page,
+    setup_page,
+)
+from service.console.log_in import LogInFirst, install_log_in
 from service.console.own_page import OwnPageOnly
-from service.console.page_frame import Place
+from service.console.page_frame import PATHS, Place
+from service.console.people import People
 from service.console.relay import install_relay
 from service.console.service_client import ServiceClient
 from service.console.texts import say
 from service.processes.child import Lifeline
+from service.processes.client_host import CONSOLE_PROOF
 
 WEB = Path(__file__).parent / "web"
-PAGES = (panel_page, missions_page, alarms_page, history_page, devices_page, setup_page, cell_page)
+PAGES = (
+    panel_page,
+    missions_page,
+    rounds_page,
+    alarms_page,
+    review_page,
+    history_page,
+    devices_page,
+    setup_page,
+    cell_page,
+)
 
 
-def create_app(client: ServiceClient, *, port: int, stop_port: int, ready: threading.Event | None = None) -> FastAPI:
+def create_app(people: People, *, port: int, stop_port: int, ready: threading.Event | None = None) -> FastAPI:
     """Return the application of the console.
 
     Args:
-        client: the client of the service that it shows.
+        people: those who use it, with their sessions at the service.
         port: its own port, from which a page in the browser finds the stop port, however it was reached.
         stop_port: port of the stop process.
         ready: set when it begins to answer.
     """
-    mirror = Mirror(client)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        mirror.start()
+        people.start()
         if ready is not None:
             ready.set()
         yield
-        await mirror.close()
+        await people.close()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
-    install_relay(app, client)
+    install_relay(app, people)
+    install_log_in(app, people)
     nicegui_app.add_static_files("/web", WEB)
-    place = Place(mirror=mirror, port=port, stop_port=stop_port)
+    place = Place(port=port, stop_port=stop_port)
     for page in PAGES:
         page.install(place)
     ui.run_with(
@@ -63,6 +85,7 @@ def create_app(client: ServiceClient, *, port: int, stop_port: int, ready: threa
         reconnect_timeout=5.0,
         language="en-US",
     )
+    app.add_middleware(LogInFirst, people=people, pages=frozenset(PATHS.values()))
     app.add_middleware(OwnPageOnly)
     return app
 
@@ -73,13 +96,14 @@ def main() -> None:
     parser.add_argument("--fd", type=int, required=True, help="bound listening socket")
     parser.add_argument("--service", required=True, help="address of the HTTP API")
     parser.add_argument("--stop-port", type=int, required=True)
+    parser.add_argument("--cookie", required=True, help="name of the cookie in which the service keeps a session")
     options = parser.parse_args()
     lifeline = Lifeline()
     listener = socket.socket(fileno=options.fd)
     ready = threading.Event()
-    app = create_app(
-        ServiceClient(options.service), port=listener.getsockname()[1], stop_port=options.stop_port, ready=ready
-    )
+    client = ServiceClient(options.service, secret=os.environ.pop(CONSOLE_PROOF, None))
+    people = People(client, cookie=options.cookie)
+    app = create_app(people, port=listener.getsockname()[1], stop_port=options.stop_port, ready=ready)
 
     def tell() -> None:
         ready.wait()

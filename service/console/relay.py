@@ -9,6 +9,7 @@ from fastapi import FastAPI, Request, Response
 
 from hal.errors import CellError
 from service.client import ApiError
+from service.console.people import People
 from service.console.service_client import QUICK_S, ServiceClient
 
 # What a page may fetch through the console: read only, and nothing that moves.
@@ -21,28 +22,29 @@ MEDIA = {".html": "text/html; charset=utf-8", ".json": "application/json", ".pdf
 REPORT_POLICY = "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline' 'self'; frame-ancestors 'none'"
 
 
-def install_relay(app: FastAPI, client: ServiceClient) -> None:
+def install_relay(app: FastAPI, people: People) -> None:
     """Add the routes under `/relay` to the console's application."""
 
     @app.get("/relay/stop")
-    async def stop_state() -> Response:
-        return await _passed_on(client, "GET", "/v1/stop", timeout_s=QUICK_S)
+    async def stop_state(request: Request) -> Response:
+        return await _passed_on(people.client_of(request.cookies), "GET", "/v1/stop", timeout_s=QUICK_S)
 
     @app.post("/relay/stop")
-    async def stop() -> Response:
-        return await _passed_on(client, "POST", "/v1/stop", timeout_s=QUICK_S)
+    async def stop(request: Request) -> Response:
+        return await _passed_on(people.client_of(request.cookies), "POST", "/v1/stop", timeout_s=QUICK_S)
 
     @app.post("/relay/stop/reset")
     async def reset(request: Request) -> Response:
-        return await _passed_on(client, "POST", "/v1/stop/reset", await request.json())
+        return await _passed_on(people.client_of(request.cookies), "POST", "/v1/stop/reset", await request.json())
 
     @app.get("/relay/{path:path}")
-    async def file(path: str) -> Response:
+    async def file(path: str, request: Request) -> Response:
         wanted = f"/{path}"
         if not PICTURES.fullmatch(wanted):
             return Response("there is nothing here\n", 404, media_type="text/plain")
         query = "?format=png&max_age_s=0.5" if wanted.endswith("/reading") else ""
         suffix = wanted[wanted.rfind(".") :] if "." in wanted.rpartition("/")[2] else ""
+        client = people.client_of(request.cookies)
         return await _passed_on(client, "GET", wanted + query, media=MEDIA.get(suffix, "image/png"))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import copy
+from collections.abc import AsyncIterator, Mapping
+from http.cookiejar import CookieJar, DefaultCookiePolicy
 from typing import Any
 
 import httpx2
@@ -10,6 +12,7 @@ import httpx2
 from hal.errors import DeviceUnavailable
 from service.client import ApiError, document
 from service.console.texts import say
+from service.processes.client_host import CONSOLE_HEADER
 
 TIMEOUT_S = 40.0
 QUICK_S = 3.0
@@ -20,12 +23,32 @@ class ServiceClient:
 
     Args:
         url: its address, for example `http://127.0.0.1:8460`.
+        secret: proves to the service that its own console asks; None for another program.
         transport: carries the requests; None for the network.
     """
 
-    def __init__(self, url: str, *, transport: httpx2.AsyncBaseTransport | None = None) -> None:
+    def __init__(
+        self, url: str, *, secret: str | None = None, transport: httpx2.AsyncBaseTransport | None = None
+    ) -> None:
         self.url = url.rstrip("/")
-        self._http = httpx2.AsyncClient(base_url=self.url, timeout=TIMEOUT_S, trust_env=False, transport=transport)
+        self._headers: Mapping[str, str] = {} if secret is None else {CONSOLE_HEADER: secret}
+        self._http = httpx2.AsyncClient(
+            base_url=self.url,
+            timeout=TIMEOUT_S,
+            trust_env=False,
+            transport=transport,
+            # It keeps no cookie of an answer: the session of one person must never go out with the request of another.
+            cookies=CookieJar(policy=DefaultCookiePolicy(allowed_domains=[])),
+        )
+
+    def in_session(self, cookie: str) -> ServiceClient:
+        """Return a client over the same connections in the session of one person; `cookie` is its name and value.
+
+        The service accepts a session only from its own origin. `OwnPageOnly` has checked the origin of the browser's request.
+        """
+        one = copy.copy(self)
+        one._headers = {**self._headers, "Cookie": cookie, "Origin": self.url}
+        return one
 
     async def get(self, path: str, *, timeout_s: float = TIMEOUT_S) -> Any:
         """Return the JSON answer to a GET request.
@@ -42,17 +65,28 @@ class ServiceClient:
 
     async def fetch(self, method: str, path: str, body: Any = None, *, timeout_s: float = TIMEOUT_S) -> bytes:
         """Return the bytes of an answer; errors as for `get`."""
-        try:
-            answer = await self._http.request(method, path, json=body, timeout=timeout_s)
-        except httpx2.RequestError as error:
-            raise DeviceUnavailable(say("service.silent"), hint=say("service.silent.hint")) from error
-        if answer.status_code >= httpx2.codes.BAD_REQUEST and path != "/readyz":
+        answer = await self.answer(method, path, body, timeout_s=timeout_s)
+        is_told = path == "/readyz" and answer.status_code == httpx2.codes.SERVICE_UNAVAILABLE
+        if answer.status_code >= httpx2.codes.BAD_REQUEST and not is_told:
             raise ApiError(_problem(answer.content, answer.status_code, self.url))
         return answer.content
 
+    async def answer(
+        self, method: str, path: str, body: Any = None, *, timeout_s: float = TIMEOUT_S
+    ) -> httpx2.Response:
+        """Return an answer as it came, also a problem.
+
+        Raises:
+            DeviceUnavailable: the service does not answer.
+        """
+        try:
+            return await self._http.request(method, path, json=body, timeout=timeout_s, headers=self._headers)
+        except httpx2.RequestError as error:
+            raise DeviceUnavailable(say("service.silent"), hint=say("service.silent.hint")) from error
+
     async def events(self, task_id: str) -> AsyncIterator[dict[str, Any]]:
         """Yield the events of a task from its beginning until it ends or the connection is lost."""
-        headers = {"Accept": "text/event-stream"}
+        headers = {**self._headers, "Accept": "text/event-stream"}
         try:
             async with self._http.stream("GET", f"/v1/tasks/{task_id}/events", headers=headers, timeout=None) as answer:
                 async for event in httpx2.EventSource(answer):

@@ -8,6 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
+from service.access.keys import Role
 from service.console.mirror import Mirror
 from service.console.page_frame import Place, attempt, live, page_frame, picks
 from service.console.texts import say
@@ -52,17 +53,20 @@ def install(place: Place) -> None:
         with page_frame(place, "setup"), ui.element("section").classes("card"):
             ui.html(say("setup.heading"), sanitize=False, tag="h2")
             listed = ui.html("", sanitize=False)
-            live(picks(listed, take, what="step"), lambda: _listed(list(checks(mirror))))
+            live(
+                picks(listed, take, what="step"),
+                lambda: _listed(list(checks(mirror)), may_take=mirror.may(Role.OPERATOR)),
+            )
 
 
-def _listed(found: list[Check]) -> str:
+def _listed(found: list[Check], *, may_take: bool) -> str:
     missing = [check for check in found if check.fix]
     line = say("setup.next", step=missing[0].fix) if missing else say("setup.ready")
     parts = [f'<p role="status"><b>{attribute(line)}</b></p><table class="list"><tbody>']
     for k, check in enumerate(found):
         state = f'<span class="chip {"warn" if check.fix else "good"}">{say("setup.missing" if check.fix else "setup.ok")}</span>'
         step = ""
-        if check.fix and check.path:
+        if check.fix and check.path and (may_take or check.path.startswith("page:")):
             is_next = check is missing[0]
             step = f'<button type="button" class="{"do" if is_next else "plain"}" data-step="{k}">{attribute(check.label)}</button>'
         fix = f'<br><span class="quiet">{attribute(check.fix)}</span>' if check.fix else ""

@@ -71,6 +71,7 @@ def create_app(
     stop_url: str,
     cookie: str = "panelwright",
     console_url: str | None = None,
+    console_secret: str | None = None,
     is_loaded: Callable[[], bool] = lambda: True,
 ) -> ASGIApp:
     """Return the ASGI application of a service, which may still be starting.
@@ -80,6 +81,7 @@ def create_app(
         stop_url: address of the stop process, which is shown to clients.
         cookie: name of the cookie of a browser's session.
         console_url: address of the console, likewise; None without one.
+        console_secret: by which a request of the console is recognised.
         is_loaded: whether the modules that compute are imported; requests that may need them wait for that.
     """
     state = AppState(
@@ -88,6 +90,7 @@ def create_app(
         origins=allowed.origins,
         cookie=cookie,
         console_url=console_url,
+        console_secret=console_secret,
         hub=Hub(),
         metrics=Metrics(service),
         readings=ReadingDesk(lambda: service.supervisor.connection),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import functools
+import secrets
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +19,7 @@ from service.core import Service
 from service.errors import Busy
 from service.http.hub import Hub
 from service.http.metrics import Metrics
+from service.processes.client_host import CONSOLE_HEADER
 from service.readings import ReadingDesk
 from service.tasks.lease import Command
 
@@ -38,6 +40,7 @@ class AppState:
         cookie: name of the session's cookie, which differs between services of one machine.
         sessions: the browsers that have logged in.
         console_url: address of the console; None without one.
+        console_secret: by which a request of the console is recognised; None without one.
         pool: threads for device reads; when silent devices fill it, further reads are refused.
         control_pool: threads for cancel, reset and starting tasks, which no device read may delay.
         stop_pool: threads for nothing but stops, which no reset that waits may delay.
@@ -52,11 +55,17 @@ class AppState:
     cookie: str = "panelwright"
     sessions: Sessions = field(default_factory=Sessions)
     console_url: str | None = None
+    console_secret: str | None = None
     started_s: float = field(default_factory=time.monotonic)
     pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(DEVICE_THREADS, "device-read"))
     control_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(CONTROL_THREADS, "control"))
     stop_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(STOP_THREADS, "stop"))
     _reading: int = 0
+
+    def is_of_console(self, request: Request) -> bool:
+        """Return whether the console sent a request."""
+        given = request.headers.get(CONSOLE_HEADER, "")
+        return self.console_secret is not None and secrets.compare_digest(given.encode(), self.console_secret.encode())
 
     async def in_thread(self, work: Callable[[], T]) -> T:
         """Run work that accesses devices or the disk outside the event loop.

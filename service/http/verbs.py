@@ -57,6 +57,8 @@ def _add(routes: APIRouter, operation: Operation) -> None:
             client=connection.client.host if connection.client is not None else None,
         )
         task = await state.act(submit)
+        if task.sub_lease is not None and state.is_of_console(connection):
+            task.sub_lease.is_of_console = True
         if wait_s > 0.0:
             await wait_with_client(state, connection, task, wait_s)
         return answer(task)

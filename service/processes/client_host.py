@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import socket
 import threading
 import time
@@ -15,6 +16,8 @@ from service.processes.child import Child
 CONSOLE = "service.console.process"  # named and not imported: the web framework stays out of this process
 GATEWAY = "service.outlets.process"
 OUTLETS, OUTLETS_KEY = "PANELWRIGHT_OUTLETS", "PANELWRIGHT_OUTLETS_KEY"  # environment of the gateway
+CONSOLE_PROOF = "PANELWRIGHT_CONSOLE_PROOF"  # environment of the console
+CONSOLE_HEADER = "Panelwright-Console"  # carries it in each request of the console
 SETTLED_S = 20.0  # a process that lived so long is started again at once
 LONGEST_PAUSE_S = 30.0
 BRIDGE_S = 60.0  # so long does a motion wait for a console that does not come back
@@ -108,8 +111,12 @@ class ConsoleHost(ClientHost):
         listener: bound socket of the console, which stays open between two processes, so that browsers wait.
         service_url: address of the HTTP API.
         stop_port: port of the stop process.
-        keep: keeps the motions that run, while the console that followed them is started again.
+        cookie: name of the cookie in which the service keeps a session.
+        keep: keeps the motions that the console began, while it is started again.
         report, module: see `ClientHost`.
+
+    Attributes:
+        secret: by which the service recognises requests of the console; it gives no right.
     """
 
     def __init__(
@@ -118,13 +125,16 @@ class ConsoleHost(ClientHost):
         *,
         service_url: str,
         stop_port: int,
+        cookie: str,
         report: Callable[[str, dict[str, Any]], None],
         keep: Callable[[], AbstractContextManager[None]] = nullcontext,
         module: str = CONSOLE,
     ) -> None:
         fd = listener.fileno()
-        arguments = ["--fd", str(fd), "--service", service_url, "--stop-port", str(stop_port)]
-        super().__init__(module, arguments, name="console", report=report, pass_fds=[fd])
+        self.secret = secrets.token_urlsafe(32)
+        arguments = ["--fd", str(fd), "--service", service_url, "--stop-port", str(stop_port), "--cookie", cookie]
+        environment = {CONSOLE_PROOF: self.secret}
+        super().__init__(module, arguments, name="console", report=report, pass_fds=[fd], environment=environment)
         self._listener = listener
         self._keep = keep
         self._bridge = ExitStack()

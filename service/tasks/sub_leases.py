@@ -27,6 +27,7 @@ class SubLease:
         lost: why it has ended; None while it is valid.
         ends_s: when it ends unless a client keeps it; only of an own one.
         keepers: number of connections that keep it at present.
+        is_of_console: whether the console began its task.
         on_loss: called once with the reason when it is lost; cancels the task.
         is_over: whether its task has ended.
     """
@@ -36,6 +37,7 @@ class SubLease:
     ends_s: float
     lost: str | None = None
     keepers: int = 0
+    is_of_console: bool = False
     on_loss: Callable[[str], object] = lambda _reason: None
     is_over: Callable[[], bool] = lambda: False
 
@@ -89,11 +91,12 @@ class SubLeases:
                 sub.ends_s = self._clock.now_s() + self.window_s
 
     @contextmanager
-    def all_kept(self) -> Iterator[None]:
-        """Keep all sub-leases that are lent now, while a client that followed their tasks is started again."""
+    def kept_of_console(self) -> Iterator[None]:
+        """Keep the sub-leases of the tasks that the console began, while it is started again."""
         with ExitStack() as kept:
             for sub in self.all():
-                kept.enter_context(self.kept(sub))
+                if sub.is_of_console:
+                    kept.enter_context(self.kept(sub))
             yield
 
     def lose(self, subs: list[SubLease], reason: str) -> None:

@@ -38,3 +38,9 @@
     for (const one of document.querySelectorAll("[data-row]")) one.classList.toggle("old", nowS - Number(one.dataset.row) > staleS);
   }, 500);
 })();
+// Ends the session with the service, then shows the log-in page.
+document.addEventListener("click", async (event) => {
+  if (!event.target.closest("#log-out")) return;
+  await fetch("/v1/session", { method: "DELETE" }).catch(() => undefined);
+  location.assign("/login.html");
+});

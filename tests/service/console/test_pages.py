@@ -16,6 +16,7 @@ from pydantic import BaseModel
 
 from hal.config import load_cell
 from hal.strict import Strict
+from service.access.keys import Role
 from service.operations import Operation, OperationContext
 from service.serve import Options, Panelwright
 from tests.service.browser import NEEDS_CHROMIUM, browser
@@ -37,7 +38,7 @@ limits = { high = 90.0 }
 what_to_do = "slide it back"
 scale = { minimum = 0.0, maximum = 100.0, unit = "%", at_min = -0.05, at_max = 0.05 }
 """
-PAGES = ("/", "/missions", "/alarms", "/history", "/devices", "/setup", "/cell")
+PAGES = ("/", "/missions", "/rounds", "/alarms", "/review", "/history", "/devices", "/setup", "/cell")
 
 
 def until(page: Any, claim: str) -> None:
@@ -92,7 +93,7 @@ def mission(context: OperationContext, request: MissionAsked) -> MissionTold:
 class Cell:
     """A service of fakes with its console. A slider that is set or read is in the history afterwards."""
 
-    def __init__(self, write_cell: WriteCell, folder: Any) -> None:
+    def __init__(self, write_cell: WriteCell, folder: Path, *, keys: dict[str, Role] | None = None) -> None:
         path = write_cell(robot=True)
         (path.parent / "panel.toml").write_text((path.parent / "panel.toml").read_text() + SLIDER)
         self.asked: list[SetRequest] = []
@@ -113,6 +114,11 @@ class Cell:
         }
         options = Options(port=0, runs_dir=folder, inline=True, console=True)
         self.service = Panelwright(load_cell(path), options, operations={**OPERATIONS, "missions": holds, **sets})
+        book = self.service.service.keys
+        self.secrets = {
+            name: book.add(name, role, valid_s=None, commit=lambda _kind, _data: None)
+            for name, role in (keys or {}).items()
+        }
         self.service.start()
         assert self.console.wait_until_ready(150.0)
 
@@ -227,6 +233,45 @@ def test_a_point_of_the_trend_shows_its_reading_and_reports_are_searched(page: A
     until(page, "document.querySelector('.main').textContent.includes('0 of 1 reports')")
 
 
+def test_readings_are_reviewed_by_keys_one_after_the_other(page: Any, cell: Cell) -> None:
+    history = cell.service.service.plant.history
+    asked = {"object": "setpoint", "kind": "slider", "unit": "%", "sigma": 2.0, "confidence": 0.4, "doubt": "it is dim"}
+    history.add([reading(k, 10.0 + k, utc_s=time.time() - 3600 + k, **asked) for k in range(20)])
+    page.goto(f"{cell.url}/review")
+    page.fill("input[aria-label='Your name, for the record']", "alice")
+    page.keyboard.press("Tab")
+    until(page, "document.querySelector('.answers').textContent.includes('29 %')")
+    page.evaluate("document.activeElement.blur()")
+    for k in range(18):
+        page.keyboard.press("1")
+        until(page, f"document.querySelector('.main').textContent.includes('you have answered {k + 1}')")
+    page.keyboard.press("u")
+    until(page, "document.querySelector('.main').textContent.includes('you have answered 19')")
+    page.fill("input[aria-label='Something else']", "33")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.main').textContent.includes('No reading waits.')")
+    rows = history.reader().page(history.ask(object="setpoint"))
+    said = [json.loads(row.reading.answered) for row in rows if row.reading.answered is not None]
+    assert sorted(one["verdict"] for one in said) == ["right"] * 18 + ["unreadable", "wrong"]
+    assert {one["by"] for one in said} == {"alice"}
+
+
+def test_a_round_is_added_shown_in_the_calendar_and_removed(page: Any, cell: Cell) -> None:
+    page.goto(f"{cell.url}/rounds")
+    page.fill("input[aria-label=Name]", "noon")
+    page.fill("input[aria-label=Mission]", "demo")
+    page.fill("input[aria-label=Times]", "0 25 * * *")
+    page.click("button:text-is('Save round')")
+    until(page, "document.body.textContent.includes('is no cron expression')")
+    page.fill("input[aria-label=Times]", "0 12 * * *")
+    page.click("button:text-is('Save round')")
+    until(page, "document.querySelector('tbody').textContent.includes('noon')")
+    page.reload()
+    until(page, "document.querySelector('.calendar').textContent.includes('12:00 noon comes')")
+    page.click("button:text-is('Remove noon')")
+    until(page, "document.querySelector('.main').textContent.includes('There is no round yet')")
+
+
 def test_a_mission_is_chosen_planned_and_taken_up_where_it_ended(page: Any, cell: Cell) -> None:
     leave_mission(cell.service.service.runs_dir / "20260103T000000-a", done=["read"])
     page.goto(f"{cell.url}/missions")
@@ -287,6 +332,39 @@ def test_the_stop_works_while_the_console_hangs(page: Any, cell: Cell) -> None:
     page.click("#stop-reset:not([hidden])")
     until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
     assert not cell.service.service.supervisor.latch.is_set()
+
+
+def test_people_log_in_see_what_their_role_may_do_and_log_out(
+    browser: Any, write_cell: WriteCell, tmp_path: Path
+) -> None:
+    keyed = Cell(write_cell, tmp_path / "runs", keys={"bob": Role.OBSERVER, "carol": Role.OPERATOR})
+    tab = browser.new_context().new_page()
+    try:
+        tab.goto(f"{keyed.url}/missions")
+        tab.wait_for_url("**/login.html?next=%2Fmissions")
+        tab.fill("#key", keyed.secrets["bob"])
+        tab.click("#login button")
+        tab.wait_for_url("**/missions")
+        until(tab, "document.querySelector('#person').textContent.includes('bob (observer')")
+        until(tab, "document.querySelector('.main').textContent.includes('Reads every object from close up')")
+        assert tab.locator("button:text-is('Run mission')").count() == 0
+        tab.click("#log-out")
+        tab.wait_for_url("**/login.html")
+        tab.fill("#key", keyed.secrets["carol"])
+        tab.click("#login button")
+        tab.wait_for_url("**/")
+        tab.goto(f"{keyed.url}/missions")
+        tab.click("button:text-is('Run mission'):not([disabled])")
+        until(tab, "document.querySelector('.steps').textContent.includes('Holding')")
+        task = keyed.service.service.tasks.all()[0]
+        assert task.by == "carol", "the journal tells who it was"
+        assert task.sub_lease is not None
+        assert task.sub_lease.is_of_console
+        tab.click("button:text-is('Cancel'):not([disabled])")
+        until(tab, "document.querySelector('.steps').textContent.includes('cancelled')")
+    finally:
+        tab.context.close()
+        keyed.service.close()
 
 
 @pytest.mark.parametrize(("width_px", "scheme"), [(1440, "light"), (390, "dark")])

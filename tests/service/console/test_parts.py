@@ -70,7 +70,7 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
     groups = "nav mode state verb column stop step did plan.station alarm alarms.do alarms.ask alarms.confirm"
     built = tuple(
-        f"{group}." for group in f"{groups} history.span history.outcome".split()
+        f"{group}." for group in f"{groups} history.span history.outcome role weekday run".split()
     )  # keys that are put together
     unused = [key for key in ENGLISH if not key.startswith(built) and not re.search(rf"(?m)^{re.escape(key)}$", told)]
     assert unused == []

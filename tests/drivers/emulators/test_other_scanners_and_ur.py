@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.emulators import lms200, rplidar, scip, ur
+from drivers.emulators import lms200, rplidar, scip, ur, ur_io
 from drivers.emulators.beams import line_m
-from drivers.emulators.scripted import ScriptedArm, ScriptedScanner, scripted_scan
+from drivers.emulators.scripted import ScriptedArm, ScriptedLights, ScriptedScanner, ScriptedTouch, scripted_scan
 from hal.devices import RangeImage
 from tests.drivers.rigs import until
 
@@ -42,6 +42,21 @@ for client in (io, dashboard, receive):
 print(json.dumps(seen))
 """
 
+UR_IO_CLIENT = """
+import sys
+from rtde_io import RTDEIOInterface
+from rtde_receive import RTDEReceiveInterface
+
+inputs, outputs, *switched = map(int, sys.argv[1:])
+names = ["timestamp", "actual_digital_input_bits", "actual_digital_output_bits"]
+receive = RTDEReceiveInterface("127.0.0.1", 125.0, names)
+io = RTDEIOInterface("127.0.0.1")
+assert all(io.setStandardDigitalOut(output, True) for output in switched)
+while (receive.getActualDigitalInputBits(), receive.getActualDigitalOutputBits()) != (inputs, outputs):
+    pass
+for client in (io, receive):
+    client.disconnect()
+"""
 
 GRABBER_INI = """
 [global]
@@ -145,6 +160,36 @@ def test_ur_rtde_reads_the_arm_and_asks_the_dashboard() -> None:
         assert seen["dashboard"] == ["Robotmode: RUNNING", "Safetystatus: NORMAL", "5.11.0.0"]
         assert seen["slider"] is True
         until(lambda: arm.stops > 0)
+    finally:
+        far_side.close()
+
+
+def read_by_ur_rtde(*, inputs: int, outputs: int, switched: tuple[int, ...] = ()) -> None:
+    """Switch outputs on with ur-rtde, and wait until it reads these bits of the inputs and the outputs."""
+    arguments = map(str, (inputs, outputs, *switched))
+    subprocess.run([sys.executable, "-c", UR_IO_CLIENT, *arguments], timeout=60, check=True)
+
+
+@pytest.mark.third_party("ur-rtde", "ur:lights")
+def test_ur_rtde_switches_the_lights_and_reads_their_feedback() -> None:
+    pytest.importorskip("rtde_io")
+    lights = ScriptedLights()
+    far_side = ur_io.start(lights, {"port": 30_004})
+    try:
+        read_by_ur_rtde(inputs=0b1010, outputs=0b1010, switched=(1, 3))
+        assert lights.on == (False, True, False, True)
+    finally:
+        far_side.close()
+
+
+@pytest.mark.third_party("ur-rtde", "ur:touch")
+def test_ur_rtde_reads_the_pads_at_the_inputs_of_the_tool() -> None:
+    pytest.importorskip("rtde_io")
+    pads = ScriptedTouch()
+    pads.contacts = (False, True)
+    far_side = ur_io.start(pads, {"port": 30_004})
+    try:
+        read_by_ur_rtde(inputs=1 << 17, outputs=0)
     finally:
         far_side.close()
 

@@ -12,7 +12,15 @@ from manipulation.skills.attempt import Attempt
 from manipulation.skills.context import SkillContext
 from manipulation.skills.crank import spoke_holds
 from manipulation.skills.initial_state import InitialState
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
+from manipulation.skills.outcome import (
+    ObjectState,
+    Outcome,
+    SkillFailure,
+    SkillReport,
+    Verify,
+    doubt_within,
+    surely_within,
+)
 from manipulation.skills.repeat import perform
 from manipulation.skills.wheel_hold import Belief, Hold, behind_two_spokes, hold_the_rim
 from manipulation.skills.wheel_turn import WheelTurn
@@ -81,9 +89,16 @@ def handwheel(
         is_reached=lambda seen: (
             where.is_sure and surely_within(where.known, target_rad, TOLERANCE_RAD, sigma=seen.sigma)
         ),
+        doubt=lambda seen: _doubt(where, target_rad, seen),
         verify=where.verify,
     )
     return report if report.reached is None else replace(report, reached=where.known)
+
+
+def _doubt(where: InitialState, target_rad: float, seen: ObjectState) -> str:
+    if not where.is_sure:
+        return "the look does not show which of its turns the wheel is in"
+    return doubt_within(where.known, target_rad, TOLERANCE_RAD, sigma=seen.sigma)
 
 
 def believed_angle(wheel: Handwheel, seen: ObjectState) -> float | None:

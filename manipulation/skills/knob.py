@@ -9,7 +9,7 @@ from hal.panel.knob import Knob
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.context import SkillContext
 from manipulation.skills.initial_state import InitialState
-from manipulation.skills.outcome import ObjectState, SkillReport, Verify, surely_within
+from manipulation.skills.outcome import ObjectState, SkillReport, Verify, doubt_within, surely_within
 from manipulation.skills.repeat import perform
 from manipulation.skills.rotary import turn_bar
 
@@ -44,6 +44,7 @@ def knob(
         DeviceFault, Stopped, Cancelled: the cell cannot go on.
     """
     name, scale = panel_object.name, panel_object.scale
+    allowed = TOLERANCE_RATIO * scale.span
     if not scale.minimum <= target <= scale.maximum:
         raise InvalidRequest(
             f"{target} {scale.unit} is off the scale of {name}", hint=f"{scale.minimum} to {scale.maximum} {scale.unit}"
@@ -61,6 +62,7 @@ def knob(
         skill="knob",
         object_name=name,
         target=f"{target:g} {scale.unit}".strip(),
-        is_reached=lambda seen: surely_within(seen.value, target, TOLERANCE_RATIO * scale.span, sigma=seen.sigma),
+        is_reached=lambda seen: surely_within(seen.value, target, allowed, sigma=seen.sigma),
+        doubt=lambda seen: doubt_within(seen.value, target, allowed, sigma=seen.sigma),
         verify=where.verify,
     )

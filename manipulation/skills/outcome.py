@@ -48,6 +48,18 @@ def surely_within(measured: float | None, goal: float, allowed: float, *, sigma:
     return measured is not None and abs(measured - goal) + SURE * sigma <= allowed
 
 
+def doubt_within(measured: float | None, goal: float, allowed: float, *, sigma: float) -> str:
+    """Return why a measurement tells neither that it is within `allowed` of the goal nor that it is not; else nothing."""
+    if measured is None:
+        return "the look shows no value"
+    if surely_within(measured, goal, allowed, sigma=sigma) or abs(measured - goal) - SURE * sigma > allowed:
+        return ""
+    return (
+        f"a look that shows {measured:.4g} and is sure to {SURE * sigma:.2g} does not tell whether it is within "
+        f"{allowed:.2g} of {goal:.4g}"
+    )
+
+
 Verify = Callable[[], ObjectState | None]
 """The caller's read-back; it returns None when it is inconclusive."""
 

@@ -25,6 +25,7 @@ def perform(
     object_name: str,
     target: str,
     is_reached: Callable[[ObjectState], bool],
+    doubt: Callable[[ObjectState], str] = lambda _: "",
     verify: Verify | None,
     attempts: int = MAX_ATTEMPTS,
     repeats: bool = True,
@@ -35,6 +36,7 @@ def perform(
     where the fingers felt the contrary, or where the hand has missed the control in every try.
 
     Args:
+        doubt: why a look that does not show the target does not show the contrary either; nothing if it does.
         repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees. Not for a
             button, whose second press undoes the first.
 
@@ -59,17 +61,15 @@ def perform(
         if seen is not None and is_reached(seen) and is_met and not attempt.is_against:
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
-        if outcome is Outcome.UNVERIFIED and seen is None:
-            cause += REFUSED if verify is not None else NO_READING if cause == ENDED else ""
-            break
         if outcome is Outcome.UNVERIFIED:
-            outcome, cause = Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"
-            if not repeats:
+            if seen is None:
+                cause += REFUSED if verify is not None else NO_READING if cause == ENDED else ""
                 break
+            outcome, cause = _denied(doubt(seen))
         if outcome is Outcome.STALLED and seen is None and not repeats:
             cause += "; it is unknown whether it had an effect, and another try might undo it"
             break
-        if outcome is Outcome.STIFF:
+        if outcome is Outcome.STIFF or (not repeats and outcome in (Outcome.SLIPPED, Outcome.UNVERIFIED)):
             break
     return SkillReport(
         skill=skill, object=object_name, target=target, outcome=outcome, cause=cause, reached=reached, seen=seen,
@@ -77,6 +77,13 @@ def perform(
         peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0),
         motions=tuple(attempt.reports), was_missed=was_missed,
     )  # fmt: skip
+
+
+def _denied(doubt: str) -> tuple[Outcome, str]:
+    """Return how a stroke ended that went all the way, where the look afterwards does not show the target."""
+    if doubt:
+        return Outcome.UNVERIFIED, f"{ENDED}, but {doubt}"
+    return Outcome.SLIPPED, "the hand went all the way; the read-back does not show the target"
 
 
 def _next(attempt: Attempt, outcome: Outcome, cause: str, verify: Verify | None) -> str:

@@ -19,7 +19,16 @@ from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import force_at_rest_n, meet
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
-from manipulation.skills.outcome import SURE, ObjectState, Outcome, SkillFailure, SkillReport, Verify, surely_within
+from manipulation.skills.outcome import (
+    SURE,
+    ObjectState,
+    Outcome,
+    SkillFailure,
+    SkillReport,
+    Verify,
+    doubt_within,
+    surely_within,
+)
 from manipulation.skills.repeat import perform
 
 TIP_HEIGHT_M = 0.007  # height of the fingertip above the plate; with a pose error it does not touch the plate
@@ -90,10 +99,14 @@ def slider(
         felt_m.append(push.start_m + _push(attempt, fader, push))
         return where.moved_to(scale.value_at(felt_m[0]))
 
-    def is_reached(seen: ObjectState) -> bool:
-        if not surely_within(seen.value, target, allowed, sigma=seen.sigma):
-            return False
-        return agree(scale, seen.value, felt_m[0] if felt_m else None)
+    def is_seen(seen: ObjectState) -> bool:
+        return surely_within(seen.value, target, allowed, sigma=seen.sigma)
+
+    def disagreement(seen: ObjectState) -> str:
+        return between_witnesses(scale, seen.value, felt_m[0] if felt_m else None)
+
+    def doubt(seen: ObjectState) -> str:
+        return disagreement(seen) if is_seen(seen) else doubt_within(seen.value, target, allowed, sigma=seen.sigma)
 
     return perform(
         context,
@@ -101,7 +114,8 @@ def slider(
         skill="slider",
         object_name=name,
         target=f"{target:g} {scale.unit}".strip(),
-        is_reached=is_reached,
+        is_reached=lambda seen: is_seen(seen) and not disagreement(seen),
+        doubt=doubt,
         verify=where.verify,
     )
 
@@ -117,9 +131,14 @@ def _check_provable(fader: Slider) -> None:
         )
 
 
-def agree(scale: Scale, seen: float | None, felt_m: float | None) -> bool:
-    """Return whether a look at the slider and the place to which it was felt to be pushed agree; not if one is missing."""
-    return seen is not None and felt_m is not None and abs(scale.place_of(seen) - felt_m) <= AGREE_M
+def between_witnesses(scale: Scale, seen: float | None, felt_m: float | None) -> str:
+    """Return how a look at the slider and the place to which it was felt to be pushed disagree; nothing if they agree."""
+    if seen is None or felt_m is None:
+        return "no look shows it" if seen is None else "no push was felt"
+    apart_m = abs(scale.place_of(seen) - felt_m)
+    if apart_m <= AGREE_M:
+        return ""
+    return f"the look shows {seen:.4g} and the push was felt to end at {scale.value_at(felt_m):.4g}, {1e3 * apart_m:.1f} mm apart"
 
 
 def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:

@@ -164,7 +164,8 @@ def _after_doubt(
     if report.is_done:
         cause = f"the panel has moved, and a look at its new place does not show {text_of(panel_object, target)}"
         return replace(report, outcome=Outcome.UNVERIFIED, cause=cause), [shift.finding]
-    if report.outcome is not Outcome.MISSED and (now is None or report.outcome is Outcome.UNVERIFIED):
+    is_unknown = report.outcome is Outcome.UNVERIFIED and report.seen is None
+    if report.outcome is not Outcome.MISSED and (now is None or is_unknown):
         return report, [shift.finding]
     ensure_space_is_known(session)
     again = _operate(session, eye, panel_object, target, now)

@@ -19,7 +19,7 @@ from manipulation.skills.attempt import Attempt
 from manipulation.skills.contact import onset, step
 from manipulation.skills.context import SkillContext
 from manipulation.skills.operate import operate
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, surely_within, wrapped
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, doubt_within, surely_within, wrapped
 from manipulation.skills.probe import contact_of
 from manipulation.skills.repeat import perform
 from manipulation.skills.retreat import retreat
@@ -135,6 +135,28 @@ def test_a_look_that_may_err_confirms_only_what_it_would_confirm_two_sigmas_off(
     assert not surely_within(71.9, 70.0, 2.0, sigma=0.3)
     assert surely_within(71.9, 70.0, 2.0, sigma=0.0)
     assert not surely_within(None, 70.0, 2.0, sigma=0.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "outcome", "said"),
+    [
+        (71.0, 0.1, Outcome.DONE, "confirms"),
+        (71.5, 0.6, Outcome.UNVERIFIED, "a look that shows 71.5 and is sure to 1.2 does not tell"),
+        (72.5, 0.6, Outcome.UNVERIFIED, "a look that shows 72.5 and is sure to 1.2 does not tell"),
+        (74.0, 0.6, Outcome.SLIPPED, "does not show the target"),
+        (None, 0.0, Outcome.UNVERIFIED, "the look shows no value"),
+    ],
+)
+def test_a_look_that_is_merely_unsure_is_not_said_to_deny_the_target(
+    value: float | None, sigma: float, outcome: Outcome, said: str
+) -> None:
+    result = perform(
+        context(COMPLETED), lambda attempt: 1.0, skill="s", object_name="o", target="70",
+        is_reached=lambda seen: surely_within(seen.value, 70.0, 2.0, sigma=seen.sigma),
+        doubt=lambda seen: doubt_within(seen.value, 70.0, 2.0, sigma=seen.sigma),
+        verify=lambda: ObjectState(name="o", value=value, sigma=sigma),
+    )  # fmt: skip
+    assert result.outcome is outcome and said in result.cause
 
 
 @given(truth=st.floats(60.0, 80.0), error=st.floats(-2.0, 2.0), sigma=st.floats(0.0, 0.9))

@@ -59,6 +59,7 @@ def _app() -> Callable[[], None]:
     from service.commands.range import batch, range_image
     from service.commands.read import read
     from service.commands.record import record, replay
+    from service.commands.report import report
     from service.commands.sweep import sweep
     from service.commands.teach import teach
     from service.commands.version import root
@@ -83,6 +84,7 @@ def _app() -> Callable[[], None]:
     app.command()(tasks.stop)
     app.command()(journal)
     app.command()(history)
+    app.command()(report)
     app.add_typer(alarms.app, name="alarms")
     app.add_typer(rounds.app, name="rounds")
     app.add_typer(review.app, name="review")

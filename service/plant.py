@@ -57,6 +57,7 @@ class Plant:
             listeners=[self.alarms.take, self._note_change],
             doubt_of=doubts.of,
             certify=self._certify,
+            alarms=self._active_alarms,
         )
         self._is_closing = threading.Event()
         self.check_rounds(cell.file.rounds, source=str(cell.path))
@@ -120,6 +121,14 @@ class Plant:
 
     def _certify(self, reading: StoredReading, crop: bytes | None) -> str:
         return self._certificate.of(reading.kind, crop, is_sure=reading.is_sure)
+
+    def _active_alarms(self) -> list[dict[str, str]]:
+        return [
+            {"object": one.name, "kind": a.kind, "says": a.says, "priority": one.priority, "what_to_do": one.what_to_do}
+            for a in self.alarms.all()
+            if a.is_active
+            for one in [self._cell.panel.object(a.object)]
+        ]
 
     def _is_active(self, alarm: str) -> bool:
         return self.alarms.get(alarm).is_active

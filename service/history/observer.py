@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from service.history.reading import StoredReading, answer_of
@@ -36,6 +36,19 @@ class Observer(Protocol):
         """Note what an object is now told to be."""
         ...
 
+    @property
+    def asked_by(self) -> str:
+        """The key, else the holder of the lease, that asked for the task; empty without both."""
+        ...
+
+    def newest(self) -> Mapping[str, Mapping[str, Any]]:
+        """Return the fields of the newest reading of each object, by its name."""
+        ...
+
+    def alarms(self) -> Sequence[dict[str, str]]:
+        """Return the alarms whose condition holds: `object`, `kind`, `says`, `priority` and `what_to_do`."""
+        ...
+
 
 class NoObserver:
     """Keeps nothing, for operations outside of a service."""
@@ -48,6 +61,19 @@ class NoObserver:
     def told(self, name: str, target: str) -> None:
         """Drop the target."""
 
+    @property
+    def asked_by(self) -> str:
+        """Nobody is known."""
+        return ""
+
+    def newest(self) -> Mapping[str, Mapping[str, Any]]:
+        """Nothing is known."""
+        return {}
+
+    def alarms(self) -> Sequence[dict[str, str]]:
+        """There are none."""
+        return ()
+
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Observations:
@@ -57,6 +83,7 @@ class Observations:
         listeners: called with readings after they were stored, for example to raise alarms.
         doubt_of: returns why a person should look at a reading; empty for one that is sure.
         certify: returns what judged cases say about a reading with this picture, as JSON; None: nothing is said.
+        alarms: returns the alarms whose condition holds.
         targets: what each object was last told to be.
     """
 
@@ -64,6 +91,7 @@ class Observations:
     listeners: list[Callable[[Sequence[StoredReading]], None]] = field(default_factory=list)
     doubt_of: Callable[[StoredReading], str] = lambda _reading: ""
     certify: Callable[[StoredReading, bytes | None], str | None] = lambda _reading, _crop: None
+    alarms: Callable[[], Sequence[dict[str, str]]] = tuple
     targets: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -111,3 +139,16 @@ class TaskObserver:
     def told(self, name: str, target: str) -> None:
         """Note what an object is now told to be; its next reading says so."""
         self._kept.targets[name] = target
+
+    @property
+    def asked_by(self) -> str:
+        """The key, else the holder of the lease, that asked for the task; see `Observer.asked_by`."""
+        return str(self._by["asked_by"])
+
+    def newest(self) -> Mapping[str, Mapping[str, Any]]:
+        """Return the fields of the newest reading of each object, by its name; see `Observer.newest`."""
+        return {reading.object: asdict(reading) for reading in self._kept.history.newest()}
+
+    def alarms(self) -> Sequence[dict[str, str]]:
+        """Return the alarms whose condition holds; see `Observer.alarms`."""
+        return self._kept.alarms()

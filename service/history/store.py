@@ -140,6 +140,10 @@ class History:
             raise NoSuchTask(f"there is no reading {reading_id} of this cell", hint="GET /v1/review lists what waits")
         return found[0]
 
+    def newest(self) -> list[StoredReading]:
+        """Return the newest reading of each object of this cell."""
+        return [row.reading for row in self.reader().newest(self._cell)]
+
     def told(self) -> dict[str, str]:
         """Return what each object was last told to be, from its newest reading."""
         return self.reader().told(self._cell)

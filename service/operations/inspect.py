@@ -23,6 +23,7 @@ from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
 from service.report.plots import cut_out, png_of
+from service.report.upright import quarter_turns, turned_image, turned_points
 from service.schema.mission_results import ReadingResult
 from service.schema.requests import InspectRequest, RecogniseRequest
 from service.schema.results import InspectResult
@@ -33,12 +34,16 @@ MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the ligh
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AnnotatedView:
-    """One image for people: RGB, uint8 (H, W, 3), with its `readings` drawn in; and the image that it was made from."""
+    """One image for people: upright RGB, uint8 (H, W, 3), with its `readings` drawn in; and the image that it was made from.
+
+    `turns` is by how many quarters to the left the image was turned.
+    """
 
     title: str
     pixels: NDArray[np.uint8]
     look: Look
     readings: tuple[ObjectReading, ...] = ()
+    turns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,14 +57,17 @@ class Inspection:
     pictures: tuple[AnnotatedView, ...]
     offset_m: float = 0.0
 
-    def crops(self) -> dict[str, bytes]:
-        """Return a picture (PNG) of each object, from the last image in which it was read, else from the first."""
+    def crops(self, *, is_upright: bool = False) -> dict[str, bytes]:
+        """Return a picture (PNG) of each object, from the last image in which it was read, else from the first.
+
+        It is turned as the camera stood, for programs, or upright for people.
+        """
         shown: dict[str, bytes] = {}
         for picture in self.pictures:
             for reading in picture.readings:
                 cut = cut_out(picture.look.pixels, reading.outline_px)
                 if cut is not None and (reading.name not in shown or reading.answered):
-                    shown[reading.name] = png_of(cut)
+                    shown[reading.name] = png_of(turned_image(cut, picture.turns if is_upright else 0))
         return shown
 
 
@@ -87,10 +95,17 @@ def inspect_here(
         look(session, view.camera)  # raises if the camera is frozen, which a second identical frame shows
         raise
     session.world.note_readings(readings)
-    drawn = draw_annotated(view.pixels, readings)
-    picture = AnnotatedView(title=title, pixels=drawn, look=view, readings=tuple(readings))
+    turns = quarter_turns(camera_from_panel.parent_from_child)
+    drawn = _upright_drawing(view, readings, turns)
+    picture = AnnotatedView(title=title, pixels=drawn, look=view, readings=tuple(readings), turns=turns)
     off_m = offset_m(view, readings, session.known_panel().parent_from_child, session.panel)
     return Inspection(readings={r.name: r for r in readings}, pictures=(picture,), offset_m=off_m)
+
+
+def _upright_drawing(view: Look, readings: Iterable[ObjectReading], turns: int) -> NDArray[np.uint8]:
+    size_px = (view.pixels.shape[1], view.pixels.shape[0])
+    turned = [replace(one, outline_px=turned_points(one.outline_px, size_px, turns)) for one in readings]
+    return draw_annotated(turned_image(view.pixels, turns), turned)
 
 
 def inspect_close(session: Session, names: Collection[str]) -> Inspection:

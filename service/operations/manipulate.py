@@ -288,6 +288,8 @@ class _Eye:
         reading = found.readings[self.witness.name]
         record = self._session.record
         mission = "" if record is None else record.mission
+        if record is not None:
+            record.crops |= found.crops(is_upright=True)
         self._session.observer.saw([reading], found.crops(), mission=mission, phase=self._at)
         return reading if reading.present and reading.answered else None
 

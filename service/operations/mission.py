@@ -16,6 +16,7 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, DeviceError, InvalidRequest, PerceptionError, Unreachable
 from hal.geometry import compose
 from perception.vision import PanelWay
+from service.errors import Defect
 from service.evaluate import AFTER
 from service.missions.conditions import Seen
 from service.missions.files import mission_of
@@ -41,6 +42,7 @@ from service.operations.session import OperationContext, Session, panel_object_o
 from service.operations.travel import leave_the_panel, park, plan_mission
 from service.problem import problem_of
 from service.report.drawing import panel_drawing
+from service.report.origin import origin_of
 from service.report.plots import lights_picture, png_of, points_picture, residual_picture
 from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
@@ -76,6 +78,8 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         panel=cell.panel.name,
         mode=cell.file.cell.mode,
         seed=cell.file.cell.seed,
+        title=progress.mission.title,
+        origin=origin_of(cell, asked_by=context.observer.asked_by, newest=context.observer.newest()),
         now_s=context.connection.clock.now_s,
     )
     progress.path = context.runs_dir / name / FILE
@@ -91,15 +95,12 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         raise
     except Exception as defect:
         # Park the arm also after a defect of this program; the task then reports the defect.
-        record.problem = {
-            "title": "Defect",
-            "detail": f"{type(defect).__name__}: {defect}",
-            "hint": "the log has the traceback; please report it",
-            "retry": "never",
-        }
+        what = f"{type(defect).__name__}: {defect}"
+        record.problem = problem_of(Defect(what, hint="the log has the traceback; please report it"))
         _park_after(session, record, defect)
         raise
     finally:
+        record.alarms = list(context.observer.alarms())
         record.outcomes = [StepResult.model_validate(asdict(one)) for one in interpreter.outcomes]
         is_reported = _report(record, context.runs_dir / name)
     return MissionResult(
@@ -378,6 +379,7 @@ def _note_depths(session: Session, record: MissionRecord, rims: Sequence[SeenRim
 def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:
     for k, picture in enumerate(found.pictures):
         record.pictures.append(Picture(name=f"{name}-{k}", title=picture.title, png=png_of(picture.pixels)))
+    record.crops |= found.crops(is_upright=True)
 
 
 def _places(session: Session, found: Inspection) -> list[ObjectPlace]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,12 +20,24 @@ Pixels = NDArray[np.uint8]
 INK, SOFT = "#1c2733", "#5a6b7b"
 MAX_PLOT_POINTS = 4000
 CROP_MARGIN_PX = 8
+MOST_PX = 1100
+ON_PLATE_M = 0.005
 
 
 def png_of(pixels: Pixels) -> bytes:
     """Encode pixels, uint8 (H, W) gray or (H, W, 3) RGB, as PNG."""
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def small_picture(path: Path) -> bytes:
+    """Return a picture of a report as JPEG of at most 1100 px; a fifth of the bytes of a camera's image as PNG."""
+    stream = io.BytesIO()
+    with Image.open(path) as image:
+        small = image.convert("RGB")
+    small.thumbnail((MOST_PX, MOST_PX))
+    small.save(stream, "JPEG", quality=88)
     return stream.getvalue()
 
 
@@ -83,7 +96,22 @@ def residual_picture(
     fx, fy, cx, cy = lens
     v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
     points = np.stack([(u - cx) / fx * depth_m, (v - cy) / fy * depth_m, depth_m], axis=-1)
-    return range_picture(depth_m, -(points - point_m) @ (-normal))
+    residual_m = (points - point_m) @ normal
+    rows, columns = box_of(np.abs(residual_m) < ON_PLATE_M)
+    return range_picture(depth_m[rows, columns], residual_m[rows, columns])
+
+
+def box_of(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and columns of what is shown: without its outermost hundredths, with a margin; all if nothing is."""
+    v, u = np.nonzero(shown)
+    if len(v) == 0:
+        return slice(None), slice(None)
+    cut = []
+    for index, length in ((v, shown.shape[0]), (u, shown.shape[1])):
+        low, high = np.quantile(index, (0.01, 0.99))
+        margin = 0.08 * (high - low) + 1
+        cut.append(slice(max(0, int(low - margin)), min(length, int(high + margin) + 1)))
+    return cut[0], cut[1]
 
 
 def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
@@ -94,7 +122,7 @@ def range_picture(depth_m: NDArray[Any], residual_m: NDArray[Any]) -> bytes:
     left.set_title("range, m", fontsize=9, color=INK)
     figure.colorbar(shown, ax=left, shrink=0.85)
     shown = right.imshow(1e3 * residual_m, cmap="coolwarm", vmin=-40, vmax=40)
-    right.set_title("distance from the fitted plane, mm (blue: in front of it)", fontsize=9, color=INK)
+    right.set_title("distance from the fitted plane, mm (red: in front of it)", fontsize=9, color=INK)
     figure.colorbar(shown, ax=right, shrink=0.85)
     for pane in (left, right):
         pane.set_axis_off()

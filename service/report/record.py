@@ -59,6 +59,9 @@ class MissionRecord:
         outcomes: how each step of the mission ended.
         depths: how far the objects stand out of the plate by several camera views, beside the panel file.
         not_parked: why the arm was not parked after an error.
+        origin: with what and for whom the mission was done; see `origin_of`.
+        crops: picture (PNG) of each object by its name, upright.
+        alarms: alarms whose condition holds at the end.
     """
 
     mission: str
@@ -66,6 +69,8 @@ class MissionRecord:
     panel: str
     mode: str
     seed: int
+    title: str = ""
+    origin: dict[str, Any] = field(default_factory=dict)
     now_s: Callable[[], float]
     started_wall: float = field(default_factory=time.time)
     steps: list[Step] = field(default_factory=list)
@@ -81,6 +86,8 @@ class MissionRecord:
     by_surfaces: list[SurfaceCheck] | None = None
     depths: list[ObjectDepth] | None = None
     not_parked: str | None = None
+    crops: dict[str, bytes] = field(default_factory=dict)
+    alarms: list[dict[str, str]] = field(default_factory=list)
     problem: ProblemFields | None = None
     started_cell_s: float = field(init=False)
 
@@ -120,6 +127,10 @@ class MissionRecord:
         return {
             "schema": 1,
             "mission": self.mission,
+            "title": self.title,
+            **self.origin,
+            "alarms": self.alarms,
+            "crops": [f"crop-{name}.png" for name in self.crops],
             "cell": self.cell,
             "panel": self.panel,
             "mode": self.mode,

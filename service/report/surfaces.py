@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from perception.range import RangeScene, picture
+from service.report.plots import box_of
 
 Pixels = NDArray[np.uint8]
 FOUND, LOST = (40, 220, 60), (255, 60, 60)
@@ -29,14 +31,31 @@ class Mark:
 def surfaces_picture(scene: RangeScene, marks: Sequence[Mark]) -> Pixels:
     """Return a picture (sH, sW, 3) RGB of the surfaces with the marks: green for found objects, red for missing ones."""
     image = np.ascontiguousarray(picture(scene))
-    scale = image.shape[0] / scene.labels.shape[0]
+    scale = image.shape[0] // scene.labels.shape[0]
     for mark in marks:
         colour = FOUND if mark.is_found else LOST
         # The centre of a pixel of the range image maps to the centre of its block in the picture.
         outline = np.round(scale * (mark.outline_px + 0.5) - 0.5).astype(np.int32)
         cv2.polylines(image, [outline.reshape(-1, 1, 2)], True, colour, 2, cv2.LINE_AA)
         _write(image, mark.text, outline, colour)
-    return np.asarray(image, np.uint8)
+    rows, columns = _panel_in(scene, marks)
+    enlarged = [
+        slice(scale * (one.start or 0), None if one.stop is None else scale * one.stop) for one in (rows, columns)
+    ]
+    return np.asarray(image[enlarged[0], enlarged[1]], np.uint8)
+
+
+def _panel_in(scene: RangeScene, marks: Sequence[Mark]) -> tuple[slice, slice]:
+    """Return the rows and columns of the surface that is most often around the objects, which is the plate."""
+    around: Counter[int] = Counter()
+    for mark in marks:
+        low, high = (
+            np.floor(mark.outline_px.min(axis=0) - 4).astype(int),
+            np.ceil(mark.outline_px.max(axis=0) + 5).astype(int),
+        )
+        around.update(scene.labels[max(0, low[1]) : max(0, high[1]), max(0, low[0]) : max(0, high[0])].ravel().tolist())
+    around.pop(0, None)
+    return box_of(scene.labels == max(around, key=around.__getitem__, default=0))
 
 
 def _write(image: Pixels, text: str, outline: NDArray[np.int32], colour: tuple[int, int, int]) -> None:

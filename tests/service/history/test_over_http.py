@@ -129,6 +129,7 @@ def test_a_task_stores_everything_that_is_known_about_a_reading(tmp_path: Path) 
     assert (c.quality, c.cause) == ("invalid", "it is not where the panel file says")
     assert [one.object for one in heard] == ["pressure", "temperature", "gone"]
     assert Observations(history=history).targets == {"pressure": "open"}
+    assert (observer.asked_by, sorted(observer.newest())) == ("alice", ["gone", "pressure", "temperature"])
 
 
 def test_a_reading_that_cannot_be_stored_is_not_passed_on(tmp_path: Path) -> None:

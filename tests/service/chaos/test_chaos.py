@@ -63,11 +63,14 @@ def test_a_motion_under_a_latched_stop_is_found_once_the_arm_had_time_to_rest() 
 
 
 def test_a_signal_that_the_service_would_inherit_as_ignored_is_not_chosen() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    # A shell that runs the tests in the background ignores SIGINT, too.
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGINT)}
+    before[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         assert ends() == [signal.SIGTERM, signal.SIGINT]
     finally:
-        signal.signal(signal.SIGHUP, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def record(kind: str, **data: Any) -> Record:

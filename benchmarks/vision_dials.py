@@ -28,23 +28,34 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnDial:
-    """Image (H, W, 3) uint8 of a dial from 0 to 10, its reading, and whether its scale is a full turn from the top."""
+    """Image (H, W, 3) uint8 of a dial from 0 to 10, its reading, and whether its scale is a full turn from the top.
+
+    `red` is the reading of a second, red pointer, or None if there is none.
+    """
 
     image: Image
     reading: float
     circular: bool
     shape: str
+    red: float | None = None
 
 
-def draw_dial(seed: int) -> DrawnDial:
-    """Draw a dial of random design, the same for the same seed."""
+def draw_dial(seed: int, *, falls: bool = False, circular: bool | None = None) -> DrawnDial:
+    """Draw a dial of random design, the same for the same seed.
+
+    Args:
+        falls: whether the numerals run counter-clockwise.
+        circular: whether the scale is a full turn; None: by the seed.
+    """
     rng = np.random.default_rng(seed)
-    circular, share = bool(rng.random() < 0.5), float(rng.uniform(0.02, 0.98))
+    by_seed, share = bool(rng.random() < 0.5), float(rng.uniform(0.02, 0.98))
+    circular = by_seed if circular is None else circular
     face = FACES[int(rng.integers(len(FACES)))]
     ink = (230, 230, 230) if sum(face) < 200 else (35, 35, 40)
     pen = Pen.on(rng, face)
-    _scale(pen, rng, ink, circular)
-    angle = share * 2 * np.pi if circular else (share - 0.5) * SPAN_RAD
+    way = -1.0 if falls else 1.0
+    _scale(pen, rng, ink, circular, way)
+    angle = way * (share * 2 * np.pi if circular else (share - 0.5) * SPAN_RAD)
     colour = ink if rng.random() < 0.35 else COLOURS[int(rng.integers(len(COLOURS)))]
     shape = str(rng.choice(SHAPES))
     _pointer(pen, rng, angle, shape, colour, ink)
@@ -86,10 +97,10 @@ class Pen:
         cv2.fillPoly(self.canvas, [np.array([self.place(angle_rad, c) for c in corners])], colour, cv2.LINE_AA, 4)
 
 
-def _scale(pen: Pen, rng: Rng, ink: Colour, circular: bool) -> None:
+def _scale(pen: Pen, rng: Rng, ink: Colour, circular: bool, way: float) -> None:
     numerals, size = float(rng.uniform(0.62, 0.70)), 0.0022 * pen.radius
     for k in range(10 if circular else 11):
-        angle = k / 10 * 2 * np.pi if circular else (k / 10 - 0.5) * SPAN_RAD
+        angle = way * (k / 10 * 2 * np.pi if circular else (k / 10 - 0.5) * SPAN_RAD)
         pen.fill(angle, [(0.80, -0.012), (0.80, 0.012), (0.93, 0.012), (0.93, -0.012)], ink)
         x, y = pen.place(angle, (numerals, 0.0))
         (w, h), _ = cv2.getTextSize(str(k), cv2.FONT_HERSHEY_SIMPLEX, size, 6)

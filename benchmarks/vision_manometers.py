@@ -26,14 +26,18 @@ WORDS = ("bar", "psi", "kPa", "kg/cm2", "MPa", "PRESSURE", "CL 1.6", "EN 837-1")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
-    """Sweep of a pointer: its angle, and the clockwise rotation of the whole gauge."""
+    """Sweep of a pointer: its angle, the clockwise rotation of the whole gauge, whether the numerals run
+    counter-clockwise, and whether a red pointer for the maximum, or for a set value, stands beside the black one.
+    """
 
     span_rad: float = SPAN_RAD
     turned_rad: float = 0.0
+    falls: bool = False
+    has_red: bool = False
 
     def angle_rad(self, share: float) -> float:
         """Return the angle of a fraction of the scale, clockwise from up."""
-        return (share - 0.5) * self.span_rad + self.turned_rad
+        return ((0.5 - share) if self.falls else (share - 0.5)) * self.span_rad + self.turned_rad
 
 
 USUAL = Way()
@@ -45,6 +49,7 @@ UNUSUAL = {
     "turned by 6 deg": Way(turned_rad=np.deg2rad(6.0)),
     "turned by 12 deg": Way(turned_rad=np.deg2rad(-12.0)),
 }
+LEAST_APART = 0.06  # of the scale: two pointers of one gauge that are nearer hide each other
 
 
 def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
@@ -56,8 +61,32 @@ def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
     level = int(rng.integers(215, 250))
     pen.disc(0.0, (0.0, 0.0), 1.0, (level, level, level - int(rng.integers(0, 15))))
     _face(pen, rng, way)
-    shape = _shadow_and_pointer(pen, rng, angle)
-    return DrawnDial(image=_photographed(pen, rng), reading=10 * share, circular=False, shape=shape)
+    red = _second_share(rng, share) if way.has_red else None
+    if red is not None:
+        _red_pointer(pen, rng, way.angle_rad(red))
+    shape = _shadow_and_pointer(pen, rng, angle, POINTERS[0] if way.has_red else None)
+    return DrawnDial(
+        image=_photographed(pen, rng),
+        reading=10 * share,
+        circular=False,
+        shape=shape,
+        red=None if red is None else 10 * red,
+    )
+
+
+def _second_share(rng: Rng, first: float) -> float:
+    """Return a share of the scale that is not too near to the first pointer's."""
+    while abs((share := float(rng.uniform(0.0, 1.0))) - first) < LEAST_APART:
+        pass
+    return share
+
+
+def _red_pointer(pen: Pen, rng: Rng, angle: float) -> None:
+    """Draw the pointer of a maximum or of a set value: red, thin, with or without a tail, below the black one."""
+    reach, half = float(rng.uniform(0.6, 0.92)), float(rng.uniform(0.008, 0.022))
+    tail = float(rng.uniform(0.0, 0.3))
+    colour = (int(rng.integers(150, 230)), int(rng.integers(15, 60)), int(rng.integers(15, 60)))
+    pen.fill(angle, [(reach, half), (-tail, half), (-tail, -half), (reach, -half)], colour)
 
 
 def _mounted(rng: Rng) -> Pen:
@@ -145,11 +174,11 @@ def _write(pen: Pen, text: str, at: tuple[float, float], size: float, ink: Colou
     cv2.putText(pen.canvas, text, where, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, thick, cv2.LINE_AA)
 
 
-def _shadow_and_pointer(pen: Pen, rng: Rng, angle: float) -> str:
+def _shadow_and_pointer(pen: Pen, rng: Rng, angle: float, fixed: Colour | None = None) -> str:
     shape = str(rng.choice(("spade", "bar", "moon", "plain")))
     reach, tail = float(rng.uniform(0.70, 0.92)), float(rng.uniform(0.22, 0.42))
     half = float(rng.uniform(0.012, 0.035))
-    colour = POINTERS[int(rng.integers(len(POINTERS)))]
+    colour = POINTERS[int(rng.integers(len(POINTERS)))] if fixed is None else fixed
     cap = CAPS[int(rng.integers(len(CAPS)))]
     hub = float(rng.uniform(0.05, 0.13))
     if rng.random() < 0.5:

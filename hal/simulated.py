@@ -32,6 +32,23 @@ class FaultInjection(Protocol):
         ...
 
 
+@runtime_checkable
+class ShowsValues(Protocol):
+    """The interface by which a drill or demonstration lets time pass for the simulated process behind the panel."""
+
+    def show(self, name: str, value: float) -> None:
+        """Let an instrument or lamp of the simulated panel show another value from now on.
+
+        Args:
+            name: of the panel file.
+            value: in the unit of its scale, also beyond its ends; a lamp is lit from 0.5 on.
+
+        Raises:
+            InvalidRequest: there is no such object, or it shows no value of a process.
+        """
+        ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectTruth:
     """The true state of an object of the simulated panel, only for the evaluation of a finished mission."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.plant import RoundSection
 from service.alarms.desk import AlarmDesk
+from service.calendar import calendar_clock
 from service.certificate.record import Certificate
 from service.history.observer import Observations
 from service.history.reading import StoredReading
@@ -30,7 +32,7 @@ Record = Callable[[str, dict[str, Any]], None]
 
 
 class Plant:
-    """The history, its review, the alarms and the rounds.
+    """The history, its review, the alarms and the rounds; they go by the calendar of `by_calendar` if there is one.
 
     Args:
         state_dir: folder of their files.
@@ -43,11 +45,13 @@ class Plant:
 
     def __init__(self, cell: Cell, state_dir: Path, *, journal: Journal, note: Record, commit: Record) -> None:
         self._cell = cell
+        self._calendar = calendar_clock()
+        self._now_s = self._calendar or time.time
         self.history = self._open_history(state_dir / "history", note)
         self._journal, self._commit = journal, commit
         self.changes = 0  # rises with each reading and each change of an alarm
         self.alarms = self._open_alarms(state_dir / "alarms.json")
-        self.review = ReviewDesk(self.history, cell.panel, cell=cell.name, commit=commit)
+        self.review = ReviewDesk(self.history, cell.panel, cell=cell.name, commit=commit, now_s=self._now_s)
         asked = cell.file.review
         newest = [row.reading for row in self.history.reader().newest(cell.name)]
         doubts = Doubts(cell.panel, sure_at=asked.sure_at, audit_share=asked.audit_share, earlier=newest)
@@ -58,6 +62,7 @@ class Plant:
             doubt_of=doubts.of,
             certify=self._certify,
             alarms=self._active_alarms,
+            now_s=self._now_s,
         )
         self._is_closing = threading.Event()
         self.check_rounds(cell.file.rounds, source=str(cell.path))
@@ -69,7 +74,8 @@ class Plant:
         Args:
             running: returns what begins and forbids rounds, given what says whether an alarm's condition holds.
         """
-        self.rounds = RoundKeeper(self._cell.file.rounds, book=self._book, cell=running(self._is_active))
+        asked = running(self._is_active)
+        self.rounds = RoundKeeper(self._cell.file.rounds, book=self._book, cell=asked, now_s=self._now_s)
 
     def start(self, *, keeps_rounds: bool) -> None:
         """Let the time of the alarms pass and begin rounds, each in a thread of its own, because both wait for the disk."""
@@ -140,7 +146,7 @@ class Plant:
     def _open_history(self, folder: Path, note: Record) -> History:
         """Open the history of readings; a damaged file is set aside, and the journal says so."""
         cell = self._cell
-        history = History(folder, cell=cell.name, panel=cell.panel.name, bounds=cell.file.history)
+        history = History(folder, cell=cell.name, panel=cell.panel.name, bounds=cell.file.history, now_s=self._now_s)
         if history.set_aside_now is not None:
             note("history-set-aside", {"file": str(history.set_aside_now)})
         return history
@@ -153,4 +159,5 @@ class Plant:
             commit=self._commit_alarm,
             recorded=self._recorded_alarms(),
             valid_at_s=reader.valid_at_s(self._cell.name, names),
+            now_s=self._calendar,
         )

@@ -99,6 +99,10 @@ class SimArm(SimDevice[JointState]):
         """Return the true state of the world; only the judge of a finished mission and tests may call this."""
         return self._world.truth(initial_s)
 
+    def show(self, name: str, value: float) -> None:
+        """Let an instrument or lamp of the panel show another value; see `hal.simulated.ShowsValues`."""
+        self._world.show(name, value)
+
     def _measure(self, frame: Frame, bias: float) -> tuple[JointState, Quality, Cause]:
         snapshot = frame.snapshot
         velocity = snapshot.velocity_rad_per_s

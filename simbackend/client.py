@@ -15,10 +15,11 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.clock import Clock, SimClock
 from hal.config import Cell
-from hal.errors import ConfigError, DeviceFault
+from hal.errors import ConfigError, DeviceFault, InvalidRequest
 from hal.registry import Context
 from hal.simulated import Truth
 from simbackend.arm_model import MODELS
+from simbackend.bodies.body import is_shown
 from simbackend.draws import Draws
 from simbackend.events import NearTriggers, schedule
 from simbackend.link import WorldLink
@@ -256,6 +257,16 @@ class WorldClient:
                 device="world",
             )
         return truth
+
+    def show(self, name: str, value: float) -> None:
+        """Let an instrument or lamp show another value from now on; see `hal.simulated.ShowsValues`."""
+        built = self.cell.built_panel or self.cell.panel
+        index = next((k for k, one in enumerate(built.objects) if one.name == name), None)
+        if index is None or not is_shown(built.objects[index]):
+            raise InvalidRequest(
+                f"{name} cannot be made to show a value", hint="name a gauge, meter, display or lamp of the panel"
+            )
+        self.ask(Op.SHOW, index, value)
 
     def ask(self, op: Op, *arguments: float) -> object:
         """Send any other request to the world, and return its answer."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,7 @@ class PanelWorld:
         self._first_body = engine.getNumBodies()
         self._light_names = frozenset(light.name for light in self.panel.lights)
         self._pictures: list[tuple[Quad, RigidTransform]] = []
+        self._first_picture: dict[str, int] = {}
         self._load_room(cell.file.workspace.floor_z_m)
         self._load_plate(draws)
         for tag in self.panel.tags:
@@ -179,6 +181,7 @@ class PanelWorld:
         pose = self.object_pose(built)
         body_kind = body_of(built.panel_object.kind)
         model = body_kind.model(built.panel_object, built.start)
+        self._first_picture[name] = len(self._pictures)
         self._pictures += [(quad, pose) for quad in model.quads]
         if model.shine is not None:
             self._shines[name] = model.shine
@@ -242,6 +245,24 @@ class PanelWorld:
         if lamp in self.lamps_on:
             self.lamps_on[lamp] = not self.lamps_on[lamp] and lamp not in self.dead
             self.paint_lamp(lamp, on=self.lamps_on[lamp])
+
+    def show(self, name: str, value: float) -> None:
+        """Let an instrument or lamp show another value; see `hal.simulated.ShowsValues`. A lamp that is out stays dark."""
+        built = self.built[name]
+        body = body_of(built.panel_object.kind)
+        start = body.showing(built.panel_object, value)
+        if start is None:
+            return
+        self.built[name] = replace(built, start=start)
+        if name in self.mechanisms:
+            self.engine.resetJointState(self.bodies[name], JOINT, start.place)
+            self.mechanisms[name].lock()
+        elif name in self.lamps_on:
+            self.lamps_on[name] = start.is_on and name not in self.dead
+            self.paint_lamp(name, on=self.lamps_on[name])
+        else:
+            for k, quad in enumerate(body.model(built.panel_object, start).quads):
+                self.scene.reprint(self._first_picture[name] + k, quad.pixels)
 
     def paint_lamp(self, name: str, *, on: bool) -> None:
         """Let an indicator lamp look lit or dark."""

@@ -102,6 +102,12 @@ class Scene:
         for channels in (0, 1, 3):
             self._compiled[channels] = _Compiled(self._albedo, self._pictures, channels)
 
+    def reprint(self, number: int, pixels: Pixels) -> None:
+        """Replace the printed face that was added as this one (from 0); its size stays."""
+        self._pictures[number] = pixels
+        for compiled in self._compiled.values():
+            compiled.print(self._pictures)
+
     def paint(self, body: int, link: int, colour: tuple[float, float, float]) -> None:
         """Give a link (-1: the base) another colour; values above 1 shine."""
         for part in self._parts:
@@ -194,11 +200,15 @@ class _Compiled:
     def __init__(self, albedo: Array, pictures: list[Pixels], channels: int) -> None:
         self._channels = channels
         self.albedo = np.stack([self.mix(colour) for colour in albedo]) if channels else np.zeros((len(albedo), 0))
+        self.print(pictures)
+
+    def print(self, pictures: list[Pixels]) -> None:
+        """Store the textures of all printed faces."""
         texels: list[NDArray[np.uint8]] = []
         table: list[tuple[int, int, int, int]] = []
         offset = 0
-        for picture in pictures if channels else []:
-            level = picture if channels == 3 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+        for picture in pictures if self._channels else []:
+            level = picture if self._channels == 3 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
             table.append((offset, level.shape[1], level.shape[0], HALVINGS))
             for _ in range(HALVINGS + 1):
                 texels.append(np.ascontiguousarray(level).ravel())

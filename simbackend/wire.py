@@ -27,6 +27,7 @@ class Op(IntEnum):
     RENDER = 2
     TRUTH = 3
     EVENT = 4
+    SHOW = 5
 
 
 class DriveCommand(IntEnum):

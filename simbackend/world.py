@@ -276,6 +276,10 @@ class World:
         begun = self._begun.setdefault(index, self.panel.base_from_panel)
         panel_events.apply(self.panel, self.cell.file.simulation.events[index], begun, fraction)
 
+    def show(self, index: int, value: float) -> None:
+        """Let the object with this number in the panel file show another value; a lamp is lit from 0.5 on."""
+        self.panel.show(self.panel.panel.objects[index].name, value)
+
     def truth(self, initial_s: float = 0.0) -> Truth:
         """Return the true states that the judge compares with.
 

@@ -49,6 +49,9 @@ def serve(pipe: Connection, images: mmap.mmap) -> None:
             case Op.EVENT:
                 world.happen(int(request[1]), float(request[2]))
                 pipe.send(None)
+            case Op.SHOW:
+                world.show(int(request[1]), float(request[2]))
+                pipe.send(None)
             case Op.CLOSE:
                 break
     world.close()

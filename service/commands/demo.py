@@ -16,6 +16,7 @@ from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, consol
 from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 from service.commands.warm import compile_first
+from service.commands.week import WEEK, run_week
 
 JUDGE_S = 30  # longest wait for a verdict
 
@@ -31,8 +32,14 @@ def demo(
     port: Annotated[int, typer.Option(min=0, max=65534, help="HTTP port; 0 takes a free one.")] = 0,
     runs: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("runs"),
     inline: Annotated[bool, typer.Option("--inline", help="Cell and stop port in this process (debugging).")] = False,
+    week: Annotated[
+        bool, typer.Option("--week", help="Run a simulated week of rounds in minutes, and check what it leaves.")
+    ] = False,
+    days: Annotated[float, typer.Option(min=1.0, max=366.0, help="Length of that week.")] = 7.0,
 ) -> None:
     """Run a mission file on a cell and write a report; the exit code is 1 when an action was not confirmed."""
+    if week:
+        run_week(cell, seed, runs=runs / WEEK, days=days, port=port, inline=inline)
     from service.serve import Options, Panelwright, exit_on_sigterm
 
     started_s, before = time.monotonic(), reports(runs)

@@ -84,6 +84,7 @@ class Observations:
         doubt_of: returns why a person should look at a reading; empty for one that is sure.
         certify: returns what judged cases say about a reading with this picture, as JSON; None: nothing is said.
         alarms: returns the alarms whose condition holds.
+        now_s: seconds since 1970.
         targets: what each object was last told to be.
     """
 
@@ -92,6 +93,7 @@ class Observations:
     doubt_of: Callable[[StoredReading], str] = lambda _reading: ""
     certify: Callable[[StoredReading, bytes | None], str | None] = lambda _reading, _crop: None
     alarms: Callable[[], Sequence[dict[str, str]]] = tuple
+    now_s: Callable[[], float] = time.time
     targets: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -116,7 +118,7 @@ class TaskObserver:
         self, readings: Iterable[ObjectReading], crops: Mapping[str, bytes], *, mission: str = "", phase: str = ""
     ) -> None:
         """Store the readings, then let the listeners see them; see `Observer.saw`."""
-        utc_s, cell_s = time.time(), self._cell_now_s()
+        utc_s, cell_s = self._kept.now_s(), self._cell_now_s()
         stored = [
             StoredReading(
                 **answer_of(reading),

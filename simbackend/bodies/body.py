@@ -53,6 +53,10 @@ class Body(ABC, Generic[K]):
     def truth(self, panel_object: K, start: Start, mechanism: Mechanism | None, *, is_lit: bool) -> ObjectTruth:
         """Return the true state for the judge of a finished mission; `is_lit` applies to objects with a `shine`."""
 
+    def showing(self, panel_object: K, value: float) -> Start | None:
+        """Return the state in which it shows a value of the process behind the panel; None for what shows none."""
+        return None
+
     def mechanism(self, engine: Any, body: int, panel_object: K, start: Start, effort_ratio: float) -> Mechanism:
         """Return the mechanism of its joint; by default that of an instrument's needle.
 
@@ -71,6 +75,11 @@ def body_of(kind: str) -> Body[Any]:
     """
     body: Body[Any] = part_of(BODIES, kind)
     return body
+
+
+def is_shown(panel_object: PanelObject) -> bool:
+    """Return whether the simulated object can be made to show a value."""
+    return body_of(panel_object.kind).showing(panel_object, 0.0) is not None
 
 
 def place_of(mechanism: Mechanism | None) -> float:

@@ -1,4 +1,4 @@
-"""Seven-segment display: a printed face that never changes."""
+"""Seven-segment display: a printed face, which is printed anew for another number."""
 
 from __future__ import annotations
 
@@ -23,13 +23,19 @@ SEGMENTS = {
 
 
 class DisplayBody(Body[Display]):
-    """Display that shows one number for the whole life of the world."""
+    """Display that shows one number until another one is to be shown."""
 
     def start(self, panel_object: Display, u: float) -> Start:
         """Return a number within its range that its digits can show."""
         low, high = _displayable(panel_object)
         value = round(low + (0.02 + 0.96 * u) * (high - low), panel_object.decimals)
         return Start(text=display_text(panel_object, value), value=value)
+
+    def showing(self, panel_object: Display, value: float) -> Start:
+        """Return a number, limited to what the digits can show."""
+        low, high = _displayable(panel_object)
+        shown = round(min(max(value, low), high), panel_object.decimals)
+        return Start(text=display_text(panel_object, shown), value=shown)
 
     def model(self, panel_object: Display, start: Start) -> ObjectModel:
         """Return the face."""

@@ -11,13 +11,17 @@ from simbackend.mechanisms import Mechanism
 
 
 class GaugeBody(Body[Gauge]):
-    """Gauge whose needle stays at one value of the scale."""
+    """Gauge whose needle stays at one value of the scale until another one is to be shown."""
 
     def start(self, panel_object: Gauge, u: float) -> Start:
         """Return a value away from the ends of the scale."""
         scale = panel_object.scale
         value = scale.minimum + (0.05 + 0.9 * u) * (scale.maximum - scale.minimum)
         return Start(place=scale.place_of(value), value=value)
+
+    def showing(self, panel_object: Gauge, value: float) -> Start:
+        """Return the needle at a value, also beyond the ends of the scale."""
+        return Start(place=panel_object.scale.place_of(value), value=value)
 
     def model(self, panel_object: Gauge, start: Start) -> ObjectModel:
         """Return face and needle."""

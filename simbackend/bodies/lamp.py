@@ -17,6 +17,10 @@ class LampBody(Body[Lamp]):
         """Return a state that is lit with probability one half."""
         return Start(is_on=u < 0.5)
 
+    def showing(self, panel_object: Lamp, value: float) -> Start:
+        """Return the lamp lit from 0.5 on."""
+        return Start(is_on=value >= 0.5)
+
     def model(self, panel_object: Lamp, start: Start) -> ObjectModel:
         """Return one round block."""
         colour, radius_m, height_m = panel_object.colour, panel_object.radius_m, panel_object.height_m

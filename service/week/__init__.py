@@ -1,0 +1,1 @@
+"""A simulated week of rounds: a plant with drifting values, run in minutes, and the checks of what it has left."""

@@ -159,10 +159,10 @@ def _alarms(left: Left) -> Iterator[Check]:
 
 
 def _above(left: Left, limit: float) -> tuple[list[int], list[int]]:
-    """Return the first round in which the pressure may be read above a limit, and the first in which it must be."""
+    """Return the first round in which the pressure may be read above a limit, and the one in which it must be at the latest."""
     may = _first(left.week.rounds, lambda one: one.truth[PRESSURE] > limit - NEAR_BAR)
     must = _first(left.week.rounds, lambda one: one.truth[PRESSURE] > limit + NEAR_BAR)
-    return may, must
+    return may, must or [len(left.week.rounds) - 1]
 
 
 def _first(rounds: Iterable[Lived], holds: Callable[[Lived], bool]) -> list[int]:
@@ -174,7 +174,7 @@ def _raised(left: Left, alarm: str, why: str, when: tuple[list[int], list[int]])
     risen = [left.round_of(float(str(one["raised_s"]))) for one in left.rises(alarm)]
     yield Check(
         says=f"the alarm {alarm} was raised once, in the round in which {why}",
-        holds=len(risen) == 1 and risen[0] is not None and bool(may) and may[0] <= risen[0] <= (must or may)[0],
+        holds=len(risen) == 1 and risen[0] is not None and bool(may) and may[0] <= risen[0] <= must[0],
         saw="never" if not risen else ", ".join(f"in round {k + 1}" for k in risen if k is not None),
     )
 
@@ -204,7 +204,7 @@ def _condition(left: Left) -> Iterator[Check]:
     may, must = _above(left, TOO_HIGH_BAR)
     yield Check(
         says=f"the valve was closed once, in the round in which the pressure was above {TOO_HIGH_BAR:g} bar",
-        holds=len(worked) == 1 and bool(may) and may[0] <= worked[0] <= (must or may)[0],
+        holds=len(worked) == 1 and bool(may) and may[0] <= worked[0] <= must[0],
         saw=", ".join(f"in round {k + 1}" for k in worked) or "never",
     )
     touched = [k for k, one in enumerate(left.week.rounds) if RELIEVE in one.steps and k not in worked]

@@ -10,10 +10,14 @@ from typing import Any
 
 from hal.config import Cell
 from hal.errors import CellError, ConfigError
+from hal.panel import Panel
+from hal.panel.limits import Limits
 from hal.plant import RoundSection
 from service.alarms.desk import AlarmDesk
+from service.alarms.limit_book import LimitBook, with_limits
 from service.calendar import calendar_clock
 from service.certificate.record import Certificate
+from service.errors import HistoryError, NoSuchTask
 from service.history.observer import Observations
 from service.history.reading import StoredReading
 from service.history.store import History
@@ -49,12 +53,13 @@ class Plant:
         self._now_s = self._calendar or time.time
         self.history = self._open_history(state_dir / "history", note)
         self._journal, self._commit = journal, commit
+        self.limits = LimitBook(state_dir / "limits.json")
         self.changes = 0  # rises with each reading and each change of an alarm
         self.alarms = self._open_alarms(state_dir / "alarms.json")
         self.review = ReviewDesk(self.history, cell.panel, cell=cell.name, commit=commit, now_s=self._now_s)
         asked = cell.file.review
         newest = [row.reading for row in self.history.reader().newest(cell.name)]
-        doubts = Doubts(cell.panel, sure_at=asked.sure_at, audit_share=asked.audit_share, earlier=newest)
+        doubts = Doubts(self.panel, sure_at=asked.sure_at, audit_share=asked.audit_share, earlier=newest)
         self._certificate = Certificate(cell.certificate_path, panel=cell.panel.name, sure_at=asked.sure_at)
         self.observations = Observations(
             history=self.history,
@@ -110,6 +115,38 @@ class Plant:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise ConfigError(f"{source}: {faults[0]}{more}", hint="correct the rounds", faults=faults)
 
+    @property
+    def panel(self) -> Panel:
+        """The panel of the cell with the limits that people have set."""
+        return self.limits.applied(self._cell.panel)
+
+    def set_limits(self, name: str, limits: Limits | None) -> None:
+        """Watch an object by other limits; None: by those of the panel file.
+
+        Raises:
+            NoSuchTask: the panel has no object of that name.
+            InvalidRequest: an object of this kind cannot have them.
+            JournalError: it could not be recorded, so nothing has changed.
+            HistoryError: it could not be stored, so nothing has changed.
+        """
+        of_file = next((one for one in self._cell.panel.objects if one.name == name), None)
+        if of_file is None:
+            raise NoSuchTask(f"the panel has no object {name!r}", hint="GET /v1/panel names its objects")
+        after = of_file if limits is None else with_limits(of_file, limits)
+        told = None if limits is None else limits.model_dump(mode="json", exclude_none=True)
+        self._commit("limits-set", {"object": name, "limits": told})
+        try:
+            self.limits.put(name, limits)
+        except OSError as error:
+            raise HistoryError(
+                f"the limits cannot be stored: {error}", hint="free the disk, then set them again"
+            ) from error
+        newest = next(
+            (row.reading for row in self.history.reader().newest(self._cell.name) if row.reading.object == name), None
+        )
+        self.alarms.redefine(after, newest)
+        self._note_change()
+
     def alarm_changes(self, after: int) -> list[dict[str, Any]]:
         """Return the changes of alarms with a greater number, oldest first; at most the newest thousand."""
         wanted = (data for data in self._recorded_alarms() if data.get("number", 0) > after)
@@ -154,7 +191,7 @@ class Plant:
     def _open_alarms(self, path: Path) -> AlarmDesk:
         reader, names = self.history.reader(), [one.name for one in self._cell.panel.objects]
         return AlarmDesk(
-            self._cell.panel,
+            self.panel,
             path=path,
             commit=self._commit_alarm,
             recorded=self._recorded_alarms(),

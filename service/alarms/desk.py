@@ -13,7 +13,7 @@ from typing import Any
 
 from hal.atomic_write import write_atomically
 from hal.errors import CellError, InvalidRequest
-from hal.panel import Panel
+from hal.panel import Panel, PanelObject
 from service.access.actor import actor
 from service.alarms.conditions import Verdict, Watch
 from service.alarms.lifecycle import Alarm, State
@@ -60,6 +60,7 @@ class AlarmDesk:
         self._now_s = steady_utc_s() if now_s is None else now_s
         known, start_s = valid_at_s or {}, self._now_s()
         watches = [Watch(panel_object=one, valid_at_s=known.get(one.name, start_s)) for one in panel.objects]
+        self._order = [one.name for one in panel.objects]
         self._watches = {watch.panel_object.name: watch for watch in watches if watch.kinds}
         self._lock = threading.RLock()
         self._number = 0
@@ -96,6 +97,34 @@ class AlarmDesk:
         if found is None:
             raise NoSuchTask("there is no such alarm", hint="GET /v1/alarms?all=true lists them")
         return found
+
+    def redefine(self, panel_object: PanelObject, newest: StoredReading | None) -> None:
+        """Watch an object by other limits from now on; its newest reading is judged by them at once.
+
+        Raises:
+            JournalError: the end of an alarm whose limit is gone, or a new alarm, could not be recorded.
+        """
+        name = panel_object.name
+        with self._lock:
+            before = self._watches.pop(name, None)
+            valid_at_s = before.valid_at_s if before is not None else self._now_s()
+            watch = Watch(panel_object=panel_object, valid_at_s=valid_at_s)
+            for alarm in [one for one in self._alarms.values() if one.object == name and one.kind not in watch.kinds]:
+                if alarm.state is not State.NORMAL:
+                    gone = Alarm(object=name, kind=alarm.kind)
+                    self._change(alarm, gone, by=actor() or THE_CELL, reason="its limit was taken away")
+                del self._alarms[alarm.id]
+            if watch.kinds:
+                self._watches[name] = watch
+            for kind in watch.kinds:
+                self._alarms.setdefault(f"{name}.{kind}", Alarm(object=name, kind=kind))
+            in_order = sorted(self._alarms.values(), key=lambda one: self._order.index(one.object))
+            self._alarms = {one.id: one for one in in_order}
+            self._save()
+            if newest is not None and watch.kinds:
+                valid_at_s = watch.valid_at_s
+                self._apply(name, watch.takes(newest, self._now_s(), self._asks(name)))
+                watch.valid_at_s = valid_at_s  # it was read when it was read
 
     def take(self, readings: Sequence[StoredReading]) -> None:
         """Judge new readings.

@@ -39,11 +39,11 @@ def install(place: Place) -> None:
                 ui.html(say("alarms.heading"), sanitize=False, tag="h2")
                 desk = _Desk(mirror)
                 listed = ui.html("", sanitize=False).classes("stack")
-                live(picks(listed, desk.do, what="deed"), lambda: alarm_table(mirror))
+                live(picks(listed, desk.do, what="deed"), lambda: alarm_table(mirror), of=mirror)
             with ui.element("section").classes("card"):
                 ui.html(say("alarms.doubts"), sanitize=False, tag="h2")
                 ui.html(say("alarms.doubts.says"), sanitize=False, tag="p").classes("quiet")
-                live(ui.html("", sanitize=False).classes("told"), lambda: _doubts(mirror))
+                live(ui.html("", sanitize=False).classes("told"), lambda: _doubts(mirror), of=mirror)
 
 
 def alarm_table(mirror: Mirror) -> str:

@@ -17,8 +17,9 @@ from service.console.service_client import QUICK_S, ServiceClient
 TICK_S = 0.25
 IDLE_S = 15.0  # nobody has looked for so long: do not ask
 LEFT_S = 600.0  # nobody has looked for so long: whoever looked has left
+FEED_S = 10.0  # so long does the service keep a question for new readings and alarms
 PERIODS_S = {
-    "ready": 1.0, "tasks": 0.5, "history": 1.0, "alarms": 1.0, "devices": 2.0, "frames": 1.0, "lease": 2.0,
+    "ready": 1.0, "tasks": 0.5, "history": 5.0, "alarms": 5.0, "devices": 2.0, "frames": 1.0, "lease": 2.0,
     "stop": 1.0, "missions": 5.0, "mission_files": 10.0, "rounds": 2.0, "review": 2.0,
     "calibrations": 10.0, "info": 10.0, "panel": 10.0, "arm": 0.25, "arm_model": 30.0,
 }  # fmt: skip
@@ -52,6 +53,7 @@ class Mirror:
         person: in whose session the client asks; the service decides what this person may do, and pages offer no more.
         problem: why the service could not be asked; None when it answers.
         events: events of a task by its id, from its beginning.
+        version: rises whenever the service says something that it has not said before.
     """
 
     def __init__(self, client: ServiceClient, *, person: Person = ANYBODY) -> None:
@@ -59,24 +61,24 @@ class Mirror:
         self.person = person
         self.problem: CellError | None = None
         self.events: dict[str, list[dict[str, Any]]] = {}
+        self.version = 0
         self._said: dict[str, Any] = {}
         self._due_s: dict[str, float] = {}
         self._looked_s = time.monotonic()
         self._wanted_s: dict[str, float] = {}
         self._followers: dict[str, asyncio.Task[None]] = {}
         self._panel: tuple[Any, Panel] | None = None
-        self._loop: asyncio.Task[None] | None = None
+        self._loops: list[asyncio.Task[None]] = []
         self._asking: set[asyncio.Task[None]] = set()
 
     def start(self) -> None:
         """Begin to ask, in the running event loop."""
-        self._loop = asyncio.create_task(self._run())
+        self._loops = [asyncio.create_task(self._run()), asyncio.create_task(self._listen())]
 
     def close(self) -> None:
         """End all requests."""
-        for task in [self._loop, *self._followers.values(), *self._asking]:
-            if task is not None:
-                task.cancel()
+        for task in [*self._loops, *self._followers.values(), *self._asking]:
+            task.cancel()
 
     def may(self, needed: Role) -> bool:
         """Return whether the role of the person permits what needs this role."""
@@ -87,6 +89,11 @@ class Mirror:
         """Whether nobody has looked for a long time, and no task needs to be followed."""
         is_following = any(not one.done() for one in self._followers.values())
         return not is_following and time.monotonic() - self._looked_s > LEFT_S
+
+    @property
+    def _is_watched(self) -> bool:
+        """Whether somebody has looked lately."""
+        return time.monotonic() - self._looked_s < IDLE_S
 
     @property
     def must_log_in(self) -> bool:
@@ -136,16 +143,51 @@ class Mirror:
         """Ask for everything at the next tick, because something was done."""
         self._due_s.clear()
 
+    async def ask_now(self, *topics: str) -> None:
+        """Ask for some topics and wait for the answers, because a page must show what was just changed."""
+        await asyncio.gather(*(self._ask(topic) for topic in topics))
+
     async def _run(self) -> None:
         while True:
             now_s = time.monotonic()
-            if now_s - self._looked_s < IDLE_S:
+            if self._is_watched:
                 for topic in self._topics_due(now_s):
                     self._due_s[topic] = now_s + QUICK_S + 1.0  # not again before it has answered
                     task = asyncio.create_task(self._ask(topic))
                     self._asking.add(task)
                     task.add_done_callback(self._asking.discard)
             await asyncio.sleep(TICK_S)
+
+    async def _listen(self) -> None:
+        """Take readings and changes of alarms as soon as they are recorded, without waiting for the next question."""
+        known = ""
+        while True:
+            if not self._is_watched:
+                known = ""  # what came meanwhile is asked for by topic
+                await asyncio.sleep(TICK_S)
+                continue
+            try:
+                found = await self.client.get(f"/v1/feed?wait_s={FEED_S}{known}", timeout_s=FEED_S + QUICK_S)
+            except CellError:
+                await asyncio.sleep(QUICK_S)
+                continue
+            known = f"&readings_after={found['readings_after']}&alarms_after={found['alarms_after']}"
+            self._take(found["readings"])
+            if found["alarms"]:
+                await self._ask("alarms")
+
+    def _take(self, readings: list[dict[str, Any]]) -> None:
+        """Put new readings in the place of older ones of the same objects."""
+        before = self._said.get("history")
+        if before is None or not readings:
+            return
+        newest = {one["object"]: one for one in [*before["newest"], *sorted(readings, key=lambda one: one["id"])]}
+        self._keep("history", {**before, "newest": list(newest.values())})
+
+    def _keep(self, topic: str, answer: Any) -> None:
+        if self._said.get(topic) != answer:
+            self.version += 1
+            self._said[topic] = answer
 
     def _topics_due(self, now_s: float) -> list[str]:
         return [
@@ -157,11 +199,12 @@ class Mirror:
 
     async def _ask(self, topic: str) -> None:
         try:
-            self._said[topic] = await self.client.get(self._path(topic), timeout_s=QUICK_S)
+            self._keep(topic, await self.client.get(self._path(topic), timeout_s=QUICK_S))
+            self.version += self.problem is not None
             self.problem = None
         except CellError as error:
             if topic in ("info", "ready"):  # a single topic may be refused, for example an arm that is missing
-                self.problem = error
+                self.problem, self.version = error, self.version + 1
                 if self.must_log_in:
                     self._said.clear()
         finally:

@@ -48,16 +48,18 @@ def install(place: Place) -> None:
                 live(ui.html("", sanitize=False).props("role=status"), desk.planned)
             with ui.element("section").classes("card half"):
                 ui.html(say("missions.now"), sanitize=False, tag="h2")
-                live(ui.html("", sanitize=False).props("role=status"), lambda: _progress(mirror))
+                live(ui.html("", sanitize=False).props("role=status"), lambda: _progress(mirror), of=mirror)
                 with ui.element("div").classes("row"):
                     end = button(say("missions.cancel"), desk.cancel, look="plain")
                 live(ui.html("", sanitize=False), lambda: steps(mirror))
             with ui.element("section").classes("card"):
                 ui.html(say("missions.reports"), sanitize=False, tag="h2")
-                live(picks(ui.html("", sanitize=False), desk.resume, what="resume"), lambda: _reports(mirror))
+                live(
+                    picks(ui.html("", sanitize=False), desk.resume, what="resume"), lambda: _reports(mirror), of=mirror
+                )
             with ui.element("section").classes("card"):
                 ui.html(say("missions.tasks"), sanitize=False, tag="h2")
-                live(ui.html("", sanitize=False), lambda: _tasks(mirror))
+                live(ui.html("", sanitize=False), lambda: _tasks(mirror), of=mirror)
 
             def enable() -> None:
                 is_busy = mirror.active is not None

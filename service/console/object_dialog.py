@@ -1,4 +1,4 @@
-"""One object: its newest reading, its history, and its work: read now, and set to a target in its own terms."""
+"""One object: its newest reading, its history, and its work: read now, set to a target in its own terms, set its limits."""
 
 from __future__ import annotations
 
@@ -11,24 +11,17 @@ from nicegui import ui
 from hal.panel import NumberGoal, PanelObject, StateGoal
 from service.access.keys import Role
 from service.client import FINAL
+from service.console.limits_form import LimitsForm
 from service.console.mirror import Mirror
-from service.console.page_frame import attempt, button, clock
+from service.console.object_facts import facts_html, history_html
+from service.console.page_frame import attempt, button
 from service.console.texts import say, word
-from service.console.values import (
-    Reading,
-    age,
-    attribute,
-    confidence,
-    label_of,
-    limits_for_people,
-    number,
-    shown,
-    sigma,
-    target_for_api,
-)
+from service.console.values import attribute, label_of, limits_for_people, number, shown, target_for_api
 
 POLL_S = 0.1
-TREND_W, TREND_H = 480, 90
+RENEW_S = 0.05
+DAY_S = 86_400.0
+SPANS_S = (None, 31 * DAY_S, DAY_S, 3600.0, 600.0)  # the longest whose readings come in one page is shown
 
 
 class ObjectDialog:
@@ -37,15 +30,17 @@ class ObjectDialog:
     def __init__(self, mirror: Mirror) -> None:
         self._mirror = mirror
         self._name = ""
-        self._target: str | float | None = None
+        self._version = -1
         self._dialog = ui.dialog().props("no-esc-dismiss")  # the Esc key is the stop
         with self._dialog, ui.card().classes("dialog"):
             self._facts = ui.html("", sanitize=False)
             self._work = ui.element("div")
             self._told = ui.html("", sanitize=False, tag="p").props("role=status")
-            with ui.element("div").classes("row"):
+            self._limits = LimitsForm(mirror)
+            self._history = ui.html("", sanitize=False)
+            with ui.element("div").classes("row end"):
                 button(say("object.close"), self._dialog.close, look="plain")
-        ui.timer(0.25, self._renew)
+        ui.timer(RENEW_S, self._renew)
 
     @property
     def _object(self) -> PanelObject | None:
@@ -55,21 +50,26 @@ class ObjectDialog:
     async def show(self, name: str) -> None:
         """Open the dialog for the object of this name."""
         self._name = name
-        if self._object is None:
+        one = self._object
+        if one is None:
             return
         self._told.set_content("")
-        self._history_html = ""
+        self._history.set_content("")
+        self._version = -1
         self._renew(even_if_closed=True)
         self._offer()
+        self._limits.show(one)
         self._dialog.open()
         await self._load_history()
 
     def _renew(self, *, even_if_closed: bool = False) -> None:
-        one = self._object
-        if one is None or not (self._dialog.value or even_if_closed):
+        if not (self._dialog.value or even_if_closed) or self._version == self._mirror.version:
             return
-        reading, alarm = self._mirror.readings().get(one.name), self._mirror.alarms().get(one.name)
-        content = _facts(one, reading, alarm) + self._history_html
+        self._version = self._mirror.version
+        one = self._object
+        if one is None:
+            return
+        content = facts_html(one, self._mirror.readings().get(one.name), self._mirror.alarms().get(one.name))
         if content != self._facts.content:
             self._facts.set_content(content)
 
@@ -77,10 +77,16 @@ class ObjectDialog:
         one = self._object
         if one is None:
             return
-        page = await attempt(lambda: self._mirror.client.get(f"/v1/history/{one.name}?limit=1000"))
-        if page is not None and self._name == one.name:
-            self._history_html = history_html(one, page["readings"])
-            self._renew()
+        newest = self._mirror.readings().get(one.name)
+        for span_s in SPANS_S:
+            since = "" if span_s is None or newest is None else f"&since_s={newest['utc_s'] - span_s}"
+            path = f"/v1/history/{one.name}?limit=1000{since}"
+            page = await attempt(partial(self._mirror.client.get, path))
+            if page is None or self._name != one.name:
+                return
+            if page["next_after"] is None:
+                break
+        self._history.set_content(history_html(one, page["readings"]))
 
     def _offer(self) -> None:
         one = self._object
@@ -88,47 +94,41 @@ class ObjectDialog:
         self._work.clear()
         with self._work:
             if not self._mirror.may(Role.OPERATOR):
-                ui.html(attribute(say("object.look_only", label=label_of(one))), sanitize=False, tag="p").classes(
-                    "quiet"
-                )
+                _line(say("object.look_only", label=label_of(one)))
                 return
-            ui.html(attribute(say("object.read_says", label=label_of(one))), sanitize=False, tag="p").classes("quiet")
-            with ui.element("div").classes("row"):
+            with ui.element("div").classes("row work"):
                 button(say("object.read"), self._read)
                 if one.goal is not None and not one.forbidden:
-                    button(say("object.set"), self._ask_target, look="plain")
+                    self._offer_targets(one, one.goal)
+            _line(say("object.read_says", label=label_of(one)))
             if one.goal is None or one.forbidden:
-                key = "object.read_only" if one.goal is None else "object.forbidden"
-                ui.html(attribute(say(key, label=label_of(one))), sanitize=False, tag="p").classes("quiet")
+                _line(say("object.read_only" if one.goal is None else "object.forbidden", label=label_of(one)))
 
-    def _ask_target(self) -> None:
-        one = self._object
-        if one is None or one.goal is None or one.forbidden:
-            return
-        goal = one.goal
-        self._work.clear()
-        with self._work:
-            if isinstance(goal, StateGoal) and not goal.states[1:]:
-                self._confirm(goal.usual)
-                return
-            field = _target_field(goal)
-            with ui.element("div").classes("row").style("margin-top:.6rem"):
-                button(say("object.set"), lambda: self._take(goal, field.value))
-                button(say("object.no"), self._offer, look="plain")
-
-    def _take(self, goal: StateGoal | NumberGoal, given: Any) -> None:
+    def _offer_targets(self, one: PanelObject, goal: StateGoal | NumberGoal) -> None:
+        """Offer a button for each state that it can be set to, or a field for a number."""
         if isinstance(goal, NumberGoal):
-            low, high, _unit = limits_for_people(goal)
-            try:
-                wanted = float(given)
-            except (TypeError, ValueError):
-                wanted = float("nan")
-            if not low <= wanted <= high:
-                self._told.set_content(attribute(say("object.bad_number", low=f"{low:g}", high=f"{high:g}")))
-                return
-            self._confirm(target_for_api(goal, wanted))
-        else:
-            self._confirm(str(given))
+            low, high, unit = limits_for_people(goal)
+            label = say("object.target_number", low=f"{low:g}", high=f"{high:g}", unit=unit)
+            field = ui.number(label=label, value=None, min=low, max=high).props("outlined dense").classes("target")
+            field.on("keydown.enter", lambda: self._take(goal, field.value))
+            button(say("object.set"), lambda: self._take(goal, field.value), look="plain")
+            return
+        now = shown(one, self._mirror.readings().get(one.name))
+        states = [state for state in goal.states if state != now] if goal.states[1:] else [goal.usual]
+        for state in states:
+            key = "object.set_to" if goal.states[1:] else "object.set_once"
+            button(say(key, target=state), partial(self._confirm, state), look="plain")
+
+    def _take(self, goal: NumberGoal, given: Any) -> None:
+        low, high, _unit = limits_for_people(goal)
+        try:
+            wanted = float(given)
+        except (TypeError, ValueError):
+            wanted = float("nan")
+        if not low <= wanted <= high:
+            self._told.set_content(attribute(say("object.bad_number", low=f"{low:g}", high=f"{high:g}")))
+            return
+        self._confirm(target_for_api(goal, wanted))
 
     def _confirm(self, target: str | float | None) -> None:
         """Say what will move, and ask."""
@@ -193,72 +193,5 @@ class ObjectDialog:
         self._told.set_content(attribute(told))
 
 
-def _target_field(goal: StateGoal | NumberGoal) -> Any:
-    """Return a field for a target: the states to choose from, or a number with its limits and unit."""
-    if isinstance(goal, StateGoal):
-        return ui.select(list(goal.states), value=goal.usual or goal.states[0], label=say("object.target")).props(
-            "outlined"
-        )
-    low, high, unit = limits_for_people(goal)
-    label = say("object.target_number", low=f"{low:g}", high=f"{high:g}", unit=unit)
-    return ui.number(label=label, value=None, min=low, max=high).props("outlined")
-
-
-def _facts(one: PanelObject, reading: Reading | None, alarm: dict[str, Any] | None) -> str:
-    parts = [f"<h2>{attribute(label_of(one))} <span class='quiet'>{attribute(one.kind.replace('_', ' '))}</span></h2>"]
-    value = shown(one, reading)
-    parts.append(f'<p style="font-size:1.7rem;margin:.2rem 0"><b id="dialog-value">{attribute(value)}</b> ')
-    parts.append(
-        f'<span class="quiet">{attribute(sigma(one, reading))} {confidence(reading)} {age(reading)}</span></p>'
-    )
-    if reading is not None:
-        if reading["quality"] != "valid":
-            parts.append(f'<p class="warn">{attribute(say("object.refused", cause=reading["cause"]))}</p>')
-        where = say(
-            "object.from", verb=word("verb", reading["verb"]), phase=reading["phase"] or clock(reading["utc_s"])
-        )
-        parts.append(f'<p class="quiet">{attribute(where)}</p>')
-    if alarm is not None:
-        told = say("object.alarm", says=alarm["says"], what_to_do=alarm["what_to_do"])
-        parts.append(f'<p class="bad">{attribute(told)}</p>')
-    return "".join(parts)
-
-
-def history_html(one: PanelObject, readings: list[Reading]) -> str:
-    """Return the trend of the values, and the last pictures."""
-    if not readings:
-        return f'<p class="quiet">{say("object.no_history")}</p>'
-    crops = [
-        f'<img src="/relay{attribute(row["crop_url"])}" alt="{attribute(say("object.crop", when=clock(row["utc_s"])))}" '
-        f'title="{attribute(clock(row["utc_s"]))}: {attribute(shown(one, row))}">'
-        for row in readings[:-7:-1]
-        if row["crop_url"]
-    ]
-    pictures = f'<h2>{say("object.pictures")}</h2><div class="crops">{"".join(crops)}</div>' if crops else ""
-    more = f'<p><a href="/history?object={one.name}">{say("history.more")}</a></p>'
-    return f"<h2>{say('object.history')}</h2>{_trend(one, readings)}{more}{pictures}"
-
-
-def _trend(one: PanelObject, readings: list[Reading]) -> str:
-    """Return values over time as a line, states as a list of changes."""
-    valued = [row for row in readings if row["value"] is not None and row["state"] is None]
-    if len(valued) < 2:
-        changes = [row for k, row in enumerate(readings) if k == 0 or shown(one, row) != shown(one, readings[k - 1])]
-        lines = "".join(
-            f"<li>{attribute(clock(row['utc_s']))} · {attribute(shown(one, row))}</li>" for row in changes[:-9:-1]
-        )
-        return f"<ul>{lines}</ul>"
-    times, values = [row["utc_s"] for row in valued], [row["value"] for row in valued]
-    low, high, since, span = min(values), max(values), times[0], max(times[-1] - times[0], 1.0)
-    height = max(high - low, 0.05 * (one.full_scale or 0.0), 1e-9)  # the noise of a steady value stays a flat line
-    top = (high + low + height) / 2
-    points = " ".join(
-        f"{TREND_W * (t - since) / span:.1f},{6 + (TREND_H - 12) * (top - v) / height:.1f}"
-        for t, v in zip(times, values, strict=True)
-    )
-    label = say("object.trend", count=len(valued), first=clock(times[0]), last=clock(times[-1]))
-    ends = f"{attribute(number(one, low, valued[0]))} – {attribute(number(one, high, valued[0]))}"
-    return (
-        f'<svg viewBox="0 0 {TREND_W} {TREND_H}" role="img" aria-label="{attribute(label)}" width="100%">'
-        f'<polyline class="trend" points="{points}"/></svg><p class="quiet">{ends} · {attribute(label)}</p>'
-    )
+def _line(text: str) -> None:
+    ui.html(attribute(text), sanitize=False, tag="p").classes("quiet")

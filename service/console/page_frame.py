@@ -29,6 +29,8 @@ PATHS = {
     "cell": "/cell",
 }
 REFRESH_S = 0.25
+LOOK_S = 0.05  # so soon does a page show what the service said
+AT_LEAST_S = 2.0  # so often it is put together again, because time passes
 # A click or the Enter key on something that carries the name of an object.
 PICK = (
     "(event) => { if (event.type === 'keydown' && !['Enter', ' '].includes(event.key)) return;"
@@ -66,8 +68,8 @@ def page_frame(place: Place, current: str) -> Iterator[None]:
     with ui.element("div").classes("main"):  # NiceGUI lays it out inside of its own <main>
         banner = ui.html("", sanitize=False).classes("banner").props("role=alert")
         yield
-    live(heading, lambda: _heading(mirror))
-    live(banner, lambda: trouble(mirror))
+    live(heading, lambda: _heading(mirror), of=mirror)
+    live(banner, lambda: trouble(mirror), of=mirror)
 
 
 def stop_box(place: Place, *, may_reset: bool) -> str:
@@ -84,16 +86,27 @@ def stop_box(place: Place, *, may_reset: bool) -> str:
     )
 
 
-def live(element: Any, render: Callable[[], str], *, every_s: float = REFRESH_S) -> None:
-    """Show what `render` returns and keep it up to date; nothing is sent while it stays the same."""
+def live(element: Any, render: Callable[[], str], *, every_s: float = REFRESH_S, of: Mirror | None = None) -> None:
+    """Show what `render` returns and keep it up to date; nothing is sent while it stays the same.
+
+    Args:
+        of: the mirror, if `render` depends on nothing else: then it is called at once when the service has said something new,
+            and seldom otherwise.
+    """
+    seen = (-1, 0.0)
 
     def renew() -> None:
+        nonlocal seen
+        if of is not None:
+            if seen[0] == of.version and time.monotonic() - seen[1] < AT_LEAST_S:
+                return
+            seen = (of.version, time.monotonic())
         content = render()
         if content != element.content:
             element.set_content(content)
 
     renew()
-    ui.timer(every_s, renew)
+    ui.timer(every_s if of is None else LOOK_S, renew)
 
 
 def button(label: str, on_click: Callable[[], Any], *, look: str = "do") -> Any:

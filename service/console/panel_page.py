@@ -27,18 +27,18 @@ def install(place: Place) -> None:
         with page_frame(place, "panel"):
             dialog = ObjectDialog(mirror)
             with ui.element("section").classes("card most"):
-                live(ui.html("", sanitize=False, tag="h2"), lambda: _title(mirror))
+                live(ui.html("", sanitize=False, tag="h2"), lambda: _title(mirror), of=mirror)
                 drawing = ui.html("", sanitize=False).classes("panel-drawing")
-                live(picks(drawing, dialog.show), lambda: _drawing(mirror))
+                live(picks(drawing, dialog.show), lambda: _drawing(mirror), of=mirror)
                 ui.html(say("panel.pick"), sanitize=False, tag="p").classes("quiet")
             with ui.element("div").classes("third"):
                 _live_picture(mirror, dialog)
                 with ui.element("section").classes("card").style("margin-top:1rem"):
-                    live(ui.html("", sanitize=False).classes("told"), lambda: last_mission(mirror))
+                    live(ui.html("", sanitize=False).classes("told"), lambda: last_mission(mirror), of=mirror)
             with ui.element("section").classes("card"):
                 ui.html(say("panel.values"), sanitize=False, tag="h2")
                 values = ui.html("", sanitize=False).classes("values")
-                live(picks(values, dialog.show), lambda: _values(mirror))
+                live(picks(values, dialog.show), lambda: _values(mirror), of=mirror)
 
 
 def _title(mirror: Mirror) -> str:
@@ -105,7 +105,7 @@ def _live_picture(mirror: Mirror, dialog: ObjectDialog) -> None:
         ui.html(say("live.heading"), sanitize=False, tag="h2")
         holder = ui.element("div").classes("live")
         with holder:
-            live(ui.html("", sanitize=False), lambda: _picture(mirror))
+            live(ui.html("", sanitize=False), lambda: _picture(mirror), of=mirror)
             overlay = ui.html("", sanitize=False).classes("overlay")
         ui.html('<p class="quiet" id="picture-line"></p>', sanitize=False)
         note = ui.html("", sanitize=False, tag="p").classes("quiet")

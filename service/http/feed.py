@@ -16,7 +16,7 @@ router = APIRouter(prefix="/v1/feed", tags=["history"], responses=RESPONSES)
 After = Annotated[
     int | None, Query(ge=0, lt=2**62, description="newest that is known; without it, only what comes from now on")
 ]
-LOOK_S = 0.1
+LOOK_S = 0.02
 BATCH = 200
 
 

@@ -21,9 +21,9 @@ async def list_frames(state: State) -> FrameList:
     return FrameList(frames=await state.in_thread(lambda: _frames(state.service)))
 
 
-@router.get("/panel", summary="The panel file", operation_id="show_panel")
+@router.get("/panel", summary="The panel file, with the limits that people have set", operation_id="show_panel")
 async def show_panel(state: State) -> dict[str, Any]:
-    return state.service.cell.panel.model_dump(mode="json", by_alias=True)
+    return state.service.plant.panel.model_dump(mode="json", by_alias=True)
 
 
 def _frames(service: Service) -> list[FrameView]:

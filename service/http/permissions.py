@@ -70,6 +70,7 @@ TABLE: dict[str, Row] = {
     "GET /v1/history/{object}": OBSERVER,
     "GET /v1/history/{object}/crops/{crop}": OBSERVER,
     "GET /v1/alarms": OBSERVER,
+    "GET /v1/limits": OBSERVER,
     "GET /v1/feed": OBSERVER,
     "GET /v1/review": OBSERVER,
     "GET /v1/rounds": OBSERVER,
@@ -96,6 +97,8 @@ TABLE: dict[str, Row] = {
     "POST /v1/alarms/{alarm}/unshelve": OPERATOR,
     "POST /v1/alarms/{alarm}/out-of-service": MAINTAINER,
     "POST /v1/alarms/{alarm}/in-service": MAINTAINER,
+    "PUT /v1/limits/{object}": MAINTAINER,
+    "DELETE /v1/limits/{object}": MAINTAINER,
     "POST /v1/review/{reading}": OPERATOR,
     "PUT /v1/rounds/{round}": MAINTAINER,  # about later; a round that is due waits while somebody holds the lease
     "DELETE /v1/rounds/{round}": MAINTAINER,

@@ -15,6 +15,7 @@ from playwright.sync_api import Error
 from pydantic import BaseModel
 
 from hal.config import load_cell
+from hal.panel.limits import Limits
 from hal.strict import Strict
 from service.access.keys import Role
 from service.operations import Operation, OperationContext
@@ -148,8 +149,10 @@ class Cell:
             "utc_s": time.time(),
         }
         stored = reading(0, value, **given)
-        self.service.service.plant.history.add([stored])
-        self.service.service.plant.alarms.take([stored])
+        plant = self.service.service.plant
+        plant.history.add([stored])
+        for listen in plant.observations.listeners:
+            listen([stored])
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +186,6 @@ def test_an_object_is_opened_read_and_set_only_after_a_yes(page: Any, cell: Cell
     page.click("g[data-object=setpoint]")
     page.click("button:text-is('Read now')")
     until(page, "document.querySelector('.dialog').textContent.includes('done. It shows 7.0 %')")
-    page.click("button:text-is('Set to …')")
     page.fill(".dialog input", "300")
     page.click(".dialog button:text-is('Set to …')")
     until(page, "document.querySelector('.dialog').textContent.includes('Give a number from 0 to 100')")
@@ -196,6 +198,25 @@ def test_an_object_is_opened_read_and_set_only_after_a_yes(page: Any, cell: Cell
     assert [(one.object, one.value) for one in cell.asked[1:]] == [("setpoint", 62.0)]
     page.click("button:text-is('Close')")
     page.wait_for_selector(".dialog", state="hidden")
+
+
+def test_a_limit_is_set_and_its_alarm_is_seen(page: Any, cell: Cell) -> None:
+    cell.record(50.0)
+    page.goto(cell.url)
+    page.click("g[data-object=setpoint]")
+    until(page, "document.querySelector('.dialog').textContent.includes('beyond high 90 %')")
+    page.click("button:text-is('Limits …')")
+    page.fill("input[aria-label='high %']", "40")
+    page.click("button:text-is('Save limits')")
+    until(page, "document.querySelector('.dialog').textContent.includes('setpoint shows 50 %, above high 40')")
+    assert cell.service.service.plant.panel.object("setpoint").limits == Limits(high=40.0)
+    page.click("button:text-is('Limits …')")
+    page.click("button:text-is('Those of the panel file')")
+    until(page, "document.querySelector('.dialog').textContent.includes('Over, but not acknowledged')")
+    until(page, "document.querySelector('.dialog').textContent.includes('beyond high 90 %')")
+    for alarm in cell.service.service.plant.alarms.all():
+        if alarm.state == "returned-unacknowledged":
+            cell.service.service.plant.alarms.acknowledge(alarm.id, by="cleaner")
 
 
 def test_an_alarm_is_acknowledged_and_shelved_with_a_reason(page: Any, cell: Cell) -> None:

@@ -26,7 +26,7 @@ from service.console.history_page import fits
 from service.console.mirror import Mirror
 from service.console.mission_words import did, step_list
 from service.console.missions_page import plan_table
-from service.console.object_dialog import history_html
+from service.console.object_facts import history_html
 from service.console.own_page import is_own
 from service.console.panel_drawing import overlay_svg, panel_svg
 from service.console.relay import PICTURES
@@ -68,7 +68,7 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
                 and isinstance(node.args[0], ast.Constant)
             ):
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
-    groups = "nav mode state verb column stop step did plan.station alarm alarms.do alarms.ask alarms.confirm"
+    groups = "nav mode state verb column stop step did plan.station alarm limits alarms.do alarms.ask alarms.confirm"
     built = tuple(
         f"{group}." for group in f"{groups} history.span history.outcome role weekday run".split()
     )  # keys that are put together

@@ -117,6 +117,8 @@ def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
         "POST /v1/review/{reading}",  # about the past
         "PUT /v1/rounds/{round}",  # about later: a round waits while somebody holds the lease
         "DELETE /v1/rounds/{round}",
+        "PUT /v1/limits/{object}",  # about alarms, for those who watch
+        "DELETE /v1/limits/{object}",
         *(f"POST /v1/alarms/{{alarm}}/{deed}" for deed in ALARM_DEEDS),  # for those who watch, whoever moves the arm
     }
 

@@ -1,0 +1,234 @@
+"""The console in a real browser beside the real service: `python -m benchmarks.console [--readings 20] [--kills 50] [--cell FILE]`.
+
+Starts `panelwright serve` and headless Chromium, and measures: from a click to the value on the page without the time of the
+reading; the event loop of the service and its stops beside a mission with ten browsers; how soon a page is painted and of use; axe
+violations over all pages; clicks for four jobs; and missions that a killed console harms. Prints a table with the pass lines, and
+returns 1 if one is missed. `--only latency,crowd,paint,axe,clicks,kills` chooses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from playwright.sync_api import Browser, sync_playwright
+
+from benchmarks.console_jobs import JOBS
+from benchmarks.console_served import FINAL, Served, new_page, served, until
+from tests.service.browser import CHROMIUM, FLAGS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ("/", "/missions", "/rounds", "/alarms", "/review", "/history", "/devices", "/setup", "/cell")
+SIZES, SCHEMES = ((1440, 900), (390, 844)), ("light", "dark")
+BROWSERS = 10
+SEEN = """(name) => { window.seenMs = null;
+  const row = () => document.querySelector(`g[data-object=${name}]`)?.dataset.row;
+  const before = row();
+  const look = () => { if (row() !== before) window.seenMs = Date.now(); else requestAnimationFrame(look); };
+  look(); }"""
+FACTS = "document.querySelector('.dialog time[data-utc]')?.dataset.utc"
+SEEN_IN_DIALOG = f"""() => {{ window.seenMs = window.clickMs = null; const before = {FACTS};
+  addEventListener('click', () => {{ window.clickMs ??= Date.now(); }}, {{ capture: true, once: true }});
+  const look = () => {{ if ({FACTS} !== before) window.seenMs = Date.now(); else requestAnimationFrame(look); }};
+  look(); }}"""
+PAINT = """() => ({ first: performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? null })"""
+USABLE = (
+    "document.querySelector('#stop-box')?.dataset.latched === 'no' && document.querySelector('g[data-object]') !== null"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """One line of the printed table."""
+
+    what: str
+    measured: str
+    wanted: str
+    is_met: bool
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print; return 1 if a pass line is missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--readings", type=int, default=20)
+    parser.add_argument("--loads", type=int, default=10)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--stops", type=int, default=200)
+    parser.add_argument("--only", default=",".join(PARTS))
+    parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
+    given = parser.parse_args(arguments)
+    lines: list[Line] = []
+    print(f"load {os.getloadavg()[0]:.1f} at the start")
+    with served(given.cell) as service, sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        service.end("/v1/missions", {"file": "inspect"})
+        for part in given.only.split(","):
+            print(f"{part} ...", flush=True)
+            lines += PARTS[part](service, browser, given)
+            for line in lines[-4:]:
+                print(f"  {line.what}: {line.measured}", flush=True)
+        browser.close()
+    print(f"load {os.getloadavg()[0]:.1f} at the end\n\n| figure | measured | pass | |\n| --- | --- | --- | --- |")
+    for line in lines:
+        print(f"| {line.what} | {line.measured} | {line.wanted} | {'met' if line.is_met else 'MISSED'} |")
+    return int(not all(line.is_met for line in lines))
+
+
+def latency(service: Served, browser: Browser, given: argparse.Namespace) -> Iterator[Line]:
+    """Measure what the console adds to a reading: from the click to the task, and from its end to the value on the page."""
+    page, watcher = new_page(browser), new_page(browser)
+    for one in (page, watcher):
+        one.goto(service.console_url)
+        until(one, USABLE)
+    page.click("g[data-object=pressure]")
+    page.wait_for_selector("button:text-is('Read now')")
+    added_s, passive_s = [], []
+    for _ in range(given.readings):
+        page.evaluate(SEEN_IN_DIALOG)
+        watcher.evaluate(SEEN, "pressure")
+        page.click("button:text-is('Read now')")
+        for one in (page, watcher):
+            until(one, "window.seenMs !== null")
+        clicked_s, seen_s = (page.evaluate(f"window.{name}Ms") / 1e3 for name in ("click", "seen"))
+        reading = next(r for r in service.client.get("/v1/history")["newest"] if r["object"] == "pressure")
+        task = service.client.get(f"/v1/tasks/{reading['task']}")
+        added_s.append((task["created_s"] - clicked_s) + max(0.0, seen_s - reading["utc_s"]))
+        passive_s.append(watcher.evaluate("window.seenMs") / 1e3 - reading["utc_s"])
+        while service.client.get(f"/v1/tasks/{reading['task']}")["state"] not in FINAL:
+            time.sleep(0.05)
+        until(page, "document.querySelector('.dialog').textContent.includes('done. It shows')")
+    for one in (page, watcher):
+        one.context.close()
+    yield _at_most(
+        "click to value, without the reading itself, p95", 1e3 * float(np.quantile(added_s, 0.95)), 300, "ms"
+    )
+    yield _at_most("reading stored to value on another page, p95", 1e3 * float(np.quantile(passive_s, 0.95)), 300, "ms")
+
+
+def crowd(service: Served, browser: Browser, given: argparse.Namespace) -> Iterator[Line]:
+    """Measure event loop and stops beside a mission that ten browsers follow on different pages."""
+    pages = [new_page(browser) for _ in range(BROWSERS)]
+    for page, path in zip(pages, [*PAGES, "/"], strict=False):
+        page.goto(service.console_url + path)
+    task = service.client.post("/v1/missions", {"file": "inspect"})
+    for page in pages:
+        until(page, "document.querySelector('#stop-box').dataset.latched === 'no'")
+    while service.client.get(f"/v1/tasks/{task['id']}")["state"] not in FINAL:
+        pages[0].wait_for_timeout(100)
+    lag_s = float(service.client.get("/v1/info")["event_loop_lag_p99_s"])
+    outcome = service.client.get(f"/v1/tasks/{task['id']}")["state"]
+    stops_s = np.array([_stop(service) for _ in range(given.stops)])
+    for page in pages:
+        page.context.close()
+    yield Line(what="mission beside ten browsers", measured=outcome, wanted="succeeded", is_met=outcome == "succeeded")
+    yield _at_most("event-loop lag beside ten browsers and a mission, p99", 1e3 * lag_s, 10, "ms")
+    yield _at_most(f"stop beside ten browsers, p99 of {given.stops}", 1e3 * float(np.quantile(stops_s, 0.99)), 10, "ms")
+
+
+def paint(service: Served, browser: Browser, given: argparse.Namespace) -> Iterator[Line]:
+    """Measure the first paint, and when drawing and stop of the panel's page are there, in fresh browser profiles."""
+    first_s, usable_s = [], []
+    for _ in range(given.loads):
+        page = new_page(browser)
+        begun_s = time.perf_counter()
+        page.goto(service.console_url, wait_until="commit")
+        until(page, USABLE, every_ms=10)
+        usable_s.append(time.perf_counter() - begun_s)
+        first_s.append(page.evaluate(PAINT)["first"] / 1e3)
+        page.context.close()
+    yield _at_most(f"first paint, median of {given.loads}", float(np.median(first_s)), 1.5, "s")
+    yield _at_most(f"usable, median of {given.loads}", float(np.median(usable_s)), 3.0, "s")
+
+
+def axe(service: Served, browser: Browser, _given: argparse.Namespace) -> Iterator[Line]:
+    """Count axe violations over all pages, light and dark, at both widths."""
+    from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
+
+    found: list[str] = []
+    for width, height in SIZES:
+        for scheme in SCHEMES:
+            page = new_page(browser, width=width, height=height, scheme=scheme, bypass_csp=True)
+            for path in PAGES:
+                page.goto(service.console_url + path)
+                until(page, "document.querySelector('.top .quiet').textContent.includes('panel')")
+                page.wait_for_timeout(1000)
+                faults = Axe().run(page).response["violations"]
+                found += [f"{path} {width} {scheme}: {one['id']} {one['nodes'][0]['html'][:100]}" for one in faults]
+            page.context.close()
+    for fault in found:
+        print(f"  {fault}")
+    yield _at_most("axe violations, 9 pages, light and dark, 1440 and 390 px", len(found), 0, "")
+
+
+def clicks(service: Served, browser: Browser, _given: argparse.Namespace) -> Iterator[Line]:
+    """Do four jobs from the panel's page as a person does, and count the clicks."""
+    for name, job in JOBS.items():
+        page = new_page(browser)
+        page.goto(service.console_url)
+        until(page, USABLE)
+        page.evaluate(
+            "() => { window.clicks = 0; addEventListener('click', () => { sessionStorage.clicks = ++window.clicks; }, true); }"
+        )
+        page.evaluate("() => { sessionStorage.clicks = 0; }")
+        job(page, service.client, until)
+        yield _at_most(f"clicks: {name}", float(page.evaluate("Number(sessionStorage.clicks)")), 3, "")
+        page.context.close()
+
+
+def kills(service: Served, _browser: Browser, given: argparse.Namespace) -> Iterator[Line]:
+    """Kill the console again and again while missions run; count the missions that did not succeed."""
+    killed, missions, harmed = 0, 0, 0
+    while killed < given.kills:
+        task = service.client.post("/v1/missions", {"file": "inspect"})
+        missions += 1
+        while service.client.get(f"/v1/tasks/{task['id']}")["state"] not in FINAL:
+            pid = service.console_pid()
+            if pid is not None and killed < given.kills:
+                os.kill(pid, signal.SIGKILL)
+                killed += 1
+            time.sleep(1.0)
+        harmed += service.client.get(f"/v1/tasks/{task['id']}")["state"] != "succeeded"
+    yield _at_most(f"missions harmed by {killed} kills of the console beside {missions} missions", harmed, 0, "")
+
+
+def _at_most(what: str, value: float, most: float, unit: str) -> Line:
+    digits = 2 if unit == "s" else 0 if not unit else 1
+    told = f"{value:.{digits}f} {unit}".rstrip()
+    return Line(what=what, measured=told, wanted=f"{most:g} {unit}".rstrip(), is_met=value <= most)
+
+
+def _stop(service: Served) -> float:
+    """Return how long a stop takes until it is answered, and reset it."""
+    import http.client
+
+    host, port = re.findall(r"//([^:/]+):(\d+)", service.stop_url)[0]
+    link = http.client.HTTPConnection(host, int(port))
+    link.connect()
+    begun_s = time.perf_counter()
+    link.request("POST", "/v1/stop")
+    state = json.loads(link.getresponse().read())
+    taken_s = time.perf_counter() - begun_s
+    link.close()
+    service.client.post("/v1/stop/reset", {"seen_count": state["count"]})
+    return taken_s
+
+
+PARTS: dict[str, Callable[[Served, Browser, argparse.Namespace], Iterator[Line]]] = {
+    "latency": latency,
+    "crowd": crowd,
+    "paint": paint,
+    "axe": axe,
+    "clicks": clicks,
+    "kills": kills,
+}
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -81,9 +81,18 @@ def until(page: Page, claim: str, *, every_ms: float = 20.0) -> None:
 
 @contextmanager
 def served(cell: Path) -> Iterator[Served]:
-    """Start the real service with its console, wait until both answer, and end them."""
+    """Start the real service with its console, wait until both answer, and end them.
+
+    The cell is served as it is, but half of its readings wait for a person, so that there is something to review.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "service.cli", "serve", "--cell", str(cell), "--port", "0", "--runs", folder]
+        text = cell.read_text(encoding="utf-8")
+        for name in ("panels", "cells"):
+            (Path(folder) / name).symlink_to(ROOT / name)
+        own = Path(folder) / "cell.toml"
+        own.write_text(f"{text}\n[review]\naudit_share = 0.5\n", encoding="utf-8")
+        runs = Path(folder) / "runs"
+        command = [sys.executable, "-m", "service.cli", "serve", "--cell", str(own), "--port", "0", "--runs", str(runs)]
         command += ["--console-port", "0"]
         with subprocess.Popen(
             command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -101,7 +110,7 @@ def served(cell: Path) -> Iterator[Served]:
             )
             client = Client(url=url, timeout_s=120.0)
             try:
-                yield Served(url=url, stop_url=stop_url, console_url=console_url, runs=Path(folder), client=client)
+                yield Served(url=url, stop_url=stop_url, console_url=console_url, runs=runs, client=client)
             finally:
                 process.terminate()
                 process.wait(60.0)

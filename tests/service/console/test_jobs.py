@@ -1,0 +1,110 @@
+"""Tests of the jobs that operators do in the console, in a real browser. Skipped if there is no Chromium."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+from hal.panel.limits import Limits
+from tests.service.browser import NEEDS_CHROMIUM
+from tests.service.console.served import Cell, leave_mission, until
+from tests.service.history.test_store import reading
+
+pytestmark = NEEDS_CHROMIUM
+
+
+def test_an_object_is_opened_read_and_set_only_after_a_yes(page: Any, cell: Cell) -> None:
+    cell.asked.clear()
+    page.click("g[data-object=setpoint]")
+    page.click("button:text-is('Read now')")
+    until(page, "document.querySelector('.dialog').textContent.includes('done. It shows 7.0 %')")
+    page.fill(".dialog input", "300")
+    page.click(".dialog button:text-is('Set to …')")
+    until(page, "document.querySelector('.dialog').textContent.includes('Give a number from 0 to 100')")
+    page.fill(".dialog input", "62")
+    page.click(".dialog button:text-is('Set to …')")
+    until(page, "document.querySelector('.dialog').textContent.includes('works it from 7.0 % to 62 %')")
+    assert len(cell.asked) == 1, "nothing moves before the yes"
+    page.click("button:text-is('Yes, move')")
+    until(page, "document.querySelector('#dialog-value').textContent === '62.0 %'")
+    assert [(one.object, one.value) for one in cell.asked[1:]] == [("setpoint", 62.0)]
+    page.click("button:text-is('Close')")
+    page.wait_for_selector(".dialog", state="hidden")
+
+
+def test_a_limit_is_set_and_its_alarm_is_seen(page: Any, cell: Cell) -> None:
+    cell.record(50.0)
+    page.goto(cell.url)
+    page.click("g[data-object=setpoint]")
+    until(page, "document.querySelector('.dialog').textContent.includes('beyond high 90 %')")
+    page.click("button:text-is('Limits …')")
+    page.fill("input[aria-label='high %']", "40")
+    page.click("button:text-is('Save limits')")
+    until(page, "document.querySelector('.dialog').textContent.includes('setpoint shows 50 %, above high 40')")
+    assert cell.service.service.plant.panel.object("setpoint").limits == Limits(high=40.0)
+    page.click("button:text-is('Limits …')")
+    page.click("button:text-is('Those of the panel file')")
+    until(page, "document.querySelector('.dialog').textContent.includes('Over, but not acknowledged')")
+    until(page, "document.querySelector('.dialog').textContent.includes('beyond high 90 %')")
+    for alarm in cell.service.service.plant.alarms.all():
+        if alarm.state == "returned-unacknowledged":
+            cell.service.service.plant.alarms.acknowledge(alarm.id, by="cleaner")
+
+
+def test_an_alarm_is_acknowledged_and_shelved_with_a_reason(page: Any, cell: Cell) -> None:
+    cell.record(95.0)
+    page.goto(f"{cell.url}/alarms")
+    until(page, "document.querySelector('tbody').textContent.includes('slide it back')")
+    page.click("button:text-is('Acknowledge')")
+    until(page, "document.body.textContent.includes('Give your name first')")
+    page.fill("input[aria-label='Your name, for the record']", "alice")
+    page.click("button:text-is('Acknowledge')")
+    until(page, "document.querySelector('tbody').textContent.includes('acknowledged')")
+    page.click("button:text-is('Shelve …')")
+    page.click("button:text-is('Shelve')")
+    until(page, "document.querySelector('.dialog').textContent.includes('Give a reason')")
+    page.fill(".dialog input[aria-label=Reason]", "test run")
+    page.click("button:text-is('Shelve')")
+    until(page, "document.querySelector('tbody').textContent.includes('alice: test run')")
+    shelved = next(one for one in cell.service.service.plant.alarms.all() if one.id == "setpoint.high")
+    assert (str(shelved.state), shelved.by, shelved.reason) == ("shelved", "alice", "test run")
+    assert 7.9 * 3600 < (shelved.shelved_until_s or 0.0) - time.time() < 8.1 * 3600
+
+
+def test_a_point_of_the_trend_shows_its_reading_and_reports_are_searched(page: Any, cell: Cell) -> None:
+    cell.record(33.5)
+    page.goto(f"{cell.url}/history?object=setpoint")
+    until(page, "document.querySelector('tbody').textContent.includes('33.5 %')")
+    chart = "getElement(Number(document.querySelector('.nicegui-echart').id.slice(1))).chart"
+    until(page, f"{chart}.getOption().series[2].data.at(-1)[1] === 33.5")
+    x, y = page.evaluate(f"{chart}.convertToPixel({{seriesIndex: 2}}, {chart}.getOption().series[2].data.at(-1))")
+    page.click(".nicegui-echart", position={"x": x, "y": y})
+    until(page, "document.querySelector('.main').textContent.includes(': 33.5')")
+    leave_mission(cell.service.service.runs_dir / "20260102T000000-a", done=["read", "feel"])
+    until(page, "document.querySelector('.main').textContent.includes('1 of 1 reports')")
+    page.fill("input[aria-label=Object]", "nothing of that name")
+    until(page, "document.querySelector('.main').textContent.includes('0 of 1 reports')")
+
+
+def test_readings_are_reviewed_by_keys_one_after_the_other(page: Any, cell: Cell) -> None:
+    history = cell.service.service.plant.history
+    asked = {"object": "setpoint", "kind": "slider", "unit": "%", "sigma": 2.0, "confidence": 0.4, "doubt": "it is dim"}
+    history.add([reading(k, 10.0 + k, utc_s=time.time() - 3600 + k, **asked) for k in range(20)])
+    page.goto(f"{cell.url}/review")
+    page.fill("input[aria-label='Your name, for the record']", "alice")
+    page.keyboard.press("Tab")
+    until(page, "document.querySelector('.answers').textContent.includes('29 %')")
+    page.evaluate("document.activeElement.blur()")
+    for k in range(18):
+        page.keyboard.press("1")
+        until(page, f"document.querySelector('.main').textContent.includes('you have answered {k + 1}')")
+    page.keyboard.press("u")
+    until(page, "document.querySelector('.main').textContent.includes('you have answered 19')")
+    page.fill("input[aria-label='Something else']", "33")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.main').textContent.includes('No reading waits.')")
+    rows = history.reader().page(history.ask(object="setpoint"))
+    said = [json.loads(row.reading.answered) for row in rows if row.reading.answered is not None]
+    assert sorted(one["verdict"] for one in said) == ["right"] * 18 + ["unreadable", "wrong"]
+    assert {one["by"] for one in said} == {"alice"}

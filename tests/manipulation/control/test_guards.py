@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.motion import Guard, MotionOutcome, Quantity, Reaction
+from hal.motion import Guard, Hold, JointTrajectory, MotionOutcome, Quantity, Reaction
 from manipulation.control.guards import GuardSet, Measured
 from manipulation.control.sensing import Sample, ToolReading
-from manipulation.control.termination import TerminationMonitor
+from manipulation.control.termination import TRANSFER_FORCE_N, TerminationMonitor, force_limit_n
 
 START = RigidTransform.from_components([0.4, -0.1, 0.5], Rotation.from_euler("z", 90, degrees=True))
 BEYOND = 1e-9
@@ -145,6 +145,7 @@ def endings(watched: TerminationMonitor, seen: ToolReading, ticks: int) -> list[
 def test_a_stop_comes_before_a_cancel_and_a_cancel_before_a_guard() -> None:
     guard = Guard(name="g", quantity=Quantity.FORCE, limit=1.0, ticks=1)
     assert endings(watch(guard, latched=True, cancelled=True), look(5.0), 1) == [MotionOutcome.STOPPED]
+    assert endings(watch(guard, latched=True), look(5.0), 1) == [MotionOutcome.STOPPED]
     assert endings(watch(guard, cancelled=True), look(5.0), 1) == [MotionOutcome.CANCELLED]
     assert endings(watch(guard), look(5.0), 1) == [MotionOutcome.GUARD]
     assert endings(watch(guard), look(0.5), 1) == [None]
@@ -163,6 +164,16 @@ def test_a_guard_that_means_a_fault_ends_in_one_and_says_at_most_or_at_least() -
 def test_the_force_limit_always_holds_and_a_start_beyond_it_may_hardly_grow(loaded_n: float, limit_n: float) -> None:
     for force_n, outcome in ((limit_n - 1e-6, None), (limit_n + 1e-6, MotionOutcome.FAULT)):
         assert endings(watch(at_start=look(loaded_n)), look(force_n), 2) == [None, outcome]
+
+
+@pytest.mark.parametrize(("cell_n", "transfer_n"), [(100.0, TRANSFER_FORCE_N), (20.0, 20.0)])
+def test_a_transfer_touches_nothing_and_may_press_less_than_a_motion_into_contact(
+    cell_n: float, transfer_n: float
+) -> None:
+    still = np.zeros((2, 6))
+    transfer = JointTrajectory(name="t", times_s=np.array([0.0, 1.0]), positions_rad=still, velocities_rad_per_s=still)
+    assert force_limit_n(transfer, cell_n) == transfer_n
+    assert force_limit_n(Hold(name="h", duration_s=1.0), cell_n) == cell_n
 
 
 def test_what_always_holds_says_how_much_it_was_and_names_an_arm_that_does_not_follow() -> None:

@@ -167,6 +167,14 @@ def test_the_filter_sends_nothing_beyond_the_joint_range_nor_above_the_speed_of_
     assert 0.049 <= fastest <= 0.0505
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_joint_that_reaches_its_limit_too_fast_to_brake_is_not_sent_beyond_it(sign: float) -> None:
+    made = made_filter(start=np.full(6, sign * (UPPER - 0.004)))
+    made.sent(np.full(6, sign * (UPPER - 0.0005)))  # 1.75 rad/s
+    np.testing.assert_array_equal(made.apply(np.full(6, sign * 4.0)), np.full(6, sign * UPPER))
+    np.testing.assert_array_equal(made.brake(), np.full(6, sign * UPPER))
+
+
 VELOCITY, ACCELERATION = np.array(T3.velocity_rad_per_s), np.array(T3.acceleration_rad_per_s2)
 FREE_TIP_M_PER_S = 10.0
 A_SHORT_LEAP_RAD = 5e-4  # a jump completed within the ticks looked back on counts as a trajectory: v^2 / 2a

@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.motion import STOPPING_S, MotionReport
+from hal.motion import STOPPING_S, Guard, MotionReport
 from manipulation.skills.attempt import Attempt
-from manipulation.skills.lever import LARGEST_N, LAST_M_PER_S, STOP_TRIES, STROKE_M_PER_S, _Arc, _to_the_stop, speed_for
+from manipulation.skills.lever import (
+    EASY_N,
+    LARGEST_N,
+    LAST_M_PER_S,
+    STOP_TRIES,
+    STROKE_M_PER_S,
+    _Arc,
+    _to_the_stop,
+    _turn_most,
+    speed_for,
+)
 
 SPAN_RAD = np.pi / 2
 AXIS = np.array([0.0, 0.0, -1.0])
@@ -19,6 +29,8 @@ RADIUS_M = 0.1
 PUSH = np.array([25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 LAG_DEG = float(np.degrees(25.0 / 5000.0 / RADIUS_M))  # the bar lags behind the tool by this angle
 START = RigidTransform.from_components([0.1, 0.0, 0.0], Rotation.identity())
+AGAINST = (1.0, 0.0, 0.0)
+WAY = _Arc(hub=np.zeros(3), axis=AXIS, radius_m=RADIUS_M, span_rad=SPAN_RAD, against=AGAINST)
 
 
 class Turned:
@@ -43,8 +55,7 @@ class Turned:
 
 def carried(ends: list[tuple[float, str | None]]) -> tuple[Turned, float]:
     attempt = Turned(ends)
-    way = _Arc(hub=np.zeros(3), axis=AXIS, radius_m=RADIUS_M, span_rad=SPAN_RAD, against=(1.0, 0.0, 0.0))
-    return attempt, _to_the_stop(cast(Attempt, attempt), way, START, LAST_M_PER_S)
+    return attempt, _to_the_stop(cast(Attempt, attempt), WAY, START, LAST_M_PER_S)
 
 
 @pytest.mark.parametrize("end", [(91.0, "end stop"), (89.5, "end stop"), (102.0, None), (83.0, "effort")])
@@ -63,6 +74,23 @@ def test_a_rise_long_before_the_state_is_passed_on_the_way_to_the_same_goal() ->
 def test_a_bar_that_is_stuck_is_not_pushed_for_ever() -> None:
     attempt, _ = carried([(82.0, "end stop")] * 10)
     assert len(attempt.goals_rad) == STOP_TRIES
+
+
+@pytest.mark.parametrize(("felt_n", "limit_n"), [(40.0, 62.0), (57.6, LARGEST_N), (80.0, LARGEST_N)])
+def test_a_heavy_bar_is_pushed_hardly_more_than_it_was_felt_to_need(felt_n: float, limit_n: float) -> None:
+    limits_n: list[float] = []
+    push = felt_n * np.array([[*AGAINST, 0.0, 0.0, 0.0]])
+
+    def along(_poses: list[RigidTransform], *, guards: tuple[Guard, ...], **_: Any) -> MotionReport:
+        limits_n.append(next(guard.limit for guard in guards if guard.axis == AGAINST))
+        tripped = "effort" if limits_n[-1] < felt_n else None
+        log = SimpleNamespace(wrench=np.repeat(push, 20, axis=0))
+        return cast(MotionReport, SimpleNamespace(tripped=tripped, base_from_tool=START, wrench=push[0], log=log))
+
+    hand = SimpleNamespace(pad_stiffness_n_per_m=5000.0)
+    attempt = SimpleNamespace(pose=lambda: START, along=along, context=SimpleNamespace(hand=hand))
+    assert _turn_most(cast(Attempt, attempt), WAY, START, 1.4) == pytest.approx(felt_n)
+    assert limits_n == [EASY_N, LARGEST_N, pytest.approx(limit_n)]
 
 
 @pytest.mark.parametrize("felt_n", [20.0, 50.0, 65.0, 80.0, LARGEST_N])

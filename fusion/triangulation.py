@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from fusion.features import Feature, Kind
 from fusion.measurement import Measurement, measurement
@@ -66,7 +66,7 @@ class PanelDepth:
     @property
     def contradicts(self) -> bool:
         """Whether the difference would arise by chance in less than one case of 10,000."""
-        return bool(chi2.sf(self.chi_square, 1) < CONTRADICT_P)
+        return bool(chdtrc(1, self.chi_square) < CONTRADICT_P)
 
 
 def triangulate(
@@ -111,7 +111,7 @@ def triangulate(
             break
     e, _ = _errors(views, point)
     chi_square, degrees = float(e @ weight @ e), 2 * len(seen) - 3
-    if chi2.sf(chi_square, degrees) < DISAGREE_P:
+    if chdtrc(degrees, chi_square) < DISAGREE_P:
         raise NotFound(
             f"the views do not see one point (chi-square {chi_square:.0f} on {degrees} degrees of freedom)",
             hint="check that the same thing was found in every view, and the calibration of the camera's mount",

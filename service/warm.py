@@ -26,7 +26,12 @@ def load_modules() -> None:
     Call it before the threads that compute start. A module with kernels that is imported holds the lock of its import and
     may wait for the compiler's; a thread that compiles holds the compiler's lock and imports.
     """
-    for name in ("service.operations.mission", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+    for name in (
+        "service.operations.mission",
+        "scipy.interpolate",
+        "matplotlib.figure",
+        "matplotlib.backends.backend_agg",
+    ):
         import_module(name)
     _warm_ups()
 

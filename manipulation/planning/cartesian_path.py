@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import RigidTransform, Rotation, RotationSpline
 
 from hal.arrays import Array
@@ -81,6 +80,8 @@ def through(
         kept, marks = _with_poses_between(kept, marks)
     if len(kept) < LEAST_SPLINE:  # nothing moves
         kept, marks = [poses[0]] * LEAST_SPLINE, 1e-9 * np.arange(float(LEAST_SPLINE))
+    from scipy.interpolate import CubicSpline  # see time_parameterization
+
     places = CubicSpline(marks, [pose.translation for pose in kept])
     turns = RotationSpline(marks, Rotation.concatenate([pose.rotation for pose in kept]))
 
@@ -149,6 +150,8 @@ def ramped(
         v = np.minimum(v, np.sqrt((slow_ratio * speed_m_per_s) ** 2 + 2.0 * ramp_m_per_s2 * to_slow))
     # Between samples the speed changes evenly with time: dt = 2 ds / (v0 + v1).
     t = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(s) / np.maximum(v[1:] + v[:-1], 1e-9))])
+    from scipy.interpolate import CubicHermiteSpline  # see time_parameterization
+
     way = CubicHermiteSpline(t, s, v)
     fine = np.arange(0.0, t[-1] + FINE_S, FINE_S)
     smooth: Array = timing_kernels.smoothed(way(np.minimum(fine, t[-1])), round(RISE_S / FINE_S))

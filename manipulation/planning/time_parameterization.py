@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
@@ -135,6 +134,8 @@ def _sampled(
     joints = timing_kernels.joints_at(geometry, step, s)
     times = tick_s * np.arange(len(s), dtype=float)
     # With the velocities of this spline the executor's cubics have a continuous acceleration.
+    from scipy.interpolate import CubicSpline  # takes 0.3 s, which the start of a service has not
+
     velocities = CubicSpline(times, joints, bc_type="clamped")(times, 1)
     return JointTrajectory(
         name=name, times_s=times, positions_rad=joints, velocities_rad_per_s=velocities, guards=guards

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 ASSURANCE = 0.95
 
@@ -14,7 +14,7 @@ def wrong_at_most(wrong: int, cases: int, *, assurance: float = ASSURANCE) -> fl
 
     Source: Clopper and Pearson, Biometrika 26 (1934), the one-sided exact bound.
     """
-    return 1.0 if wrong >= cases else float(beta.ppf(assurance, wrong + 1, cases - wrong))
+    return 1.0 if wrong >= cases else float(betaincinv(wrong + 1, cases - wrong, assurance))
 
 
 def by_cluster(cases: Iterable[tuple[str, bool]]) -> tuple[int, int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import cv2
 import numpy as np
 
 GLARE_LEVEL = 250
@@ -36,6 +35,8 @@ NAMES = tuple(field.name for field in fields(Features))
 
 def features_of(png: bytes) -> Features | None:
     """Return the measures of a picture; None if it cannot be read."""
+    import cv2  # a second of the start of the service, which needs it for judged pictures only
+
     gray = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if gray is None or min(gray.shape) < 3:
         return None

@@ -34,3 +34,11 @@ def test_a_stage_runs_through(stage: str) -> None:
 
 def test_the_picture_that_warms_the_display_reader_is_read() -> None:
     assert read_photographed_display(vision.three_eights(), scene=True).text == "88.8"
+
+
+def test_a_service_starts_without_the_libraries_that_only_computing_needs() -> None:
+    """Each of them takes 0.1 to 1 s of the processor, which a service that was killed does not have until it is back."""
+    heavy = ("scipy.stats", "scipy.interpolate", "scipy.optimize", "cv2", "matplotlib", "pybullet", "pandas")
+    code = f"import sys, service.serve, service.http.app; print([name for name in {heavy} if name in sys.modules])"
+    told = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hal.arrays import Array, Image
 from hal.calibration import CameraIntrinsics
@@ -67,7 +67,7 @@ def find_by_looks(
     built = np.array([rim.built_covariance_px for rim in rims])
     found = pose_from_points(points_m, points_px, block_diag(*(noise + built)), intrinsics)
     freedom = 2 * len(rims) - 6
-    if chi2.sf(found.chi_square, freedom) < WRONG_FIT_P:
+    if chdtrc(freedom, found.chi_square) < WRONG_FIT_P:
         raise WrongMark(
             f"the rims of {len(rims)} objects were seen, but not where the panel file has them"
             f" (chi-square {found.chi_square:.0f} on {freedom} degrees of freedom)",

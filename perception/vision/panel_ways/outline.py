@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
@@ -63,7 +63,7 @@ def find_by_outline(
     back = np.linalg.inv(measured.edge_normals_px)
     built = (panel.tolerances.edge_m * pixel_m) ** 2 * back @ back.transpose(0, 2, 1)
     found = pose_from_points(corners_m, measured.points_px, block_diag(*(noise + built)), intrinsics)
-    if chi2.sf(found.chi_square, 2) < WRONG_FIT_P:
+    if chdtrc(2, found.chi_square) < WRONG_FIT_P:
         raise WrongMark(
             f"the outline does not fit a plate of {panel.width_m:g} x {panel.height_m:g} m"
             f" (chi-square {found.chi_square:.0f} on 2 degrees of freedom)",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hal.arrays import Array
 from hal.errors import PerceptionError
@@ -79,5 +79,5 @@ def compare(one: PanelSighting, other: PanelSighting) -> Comparison:
         position_m=float(np.linalg.norm(off[:3])),
         angle_rad=float(np.linalg.norm(off[3:])),
         chi_square=chi_square,
-        contradicts=bool(chi2.sf(chi_square, 6) < DISAGREE_P),
+        contradicts=bool(chdtrc(6, chi_square) < DISAGREE_P),
     )

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hal.arrays import Array, Image
 from hal.calibration import CameraIntrinsics
@@ -169,7 +169,7 @@ def _check_places(
     prior: PanelPrior,
 ) -> None:
     """Raise `WrongMark` if the fit is too bad for the stated errors."""
-    if chi2.sf(found.chi_square, 8 * len(seen) - 6) >= WRONG_FIT_P:
+    if chdtrc(8 * len(seen) - 6, found.chi_square) >= WRONG_FIT_P:
         return
     culprit = ""
     if len(seen) > 2:

@@ -17,14 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.child_python import module_command
 from hal.errors import DeviceUnavailable
 from hal.process_state import ProcessState, process_state
+from hal.spare_process import start_module
 from simbackend.wire import DOUBLE, IMAGE_BYTES, REQUEST, SNAPSHOT, Op, WorldConfig, read_exactly
 
 START_S = 180.0  # the first start on a machine compiles the rasteriser; later ones take two seconds
 CLOSE_S = 2.0
 SUSPENDED_S = 1.0  # a world that a debugger holds for longer is given up
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # the other core is for the cell
 ANSWER_S = 20.0  # the longest answer, a large picture on a busy machine, takes about a second
 
 
@@ -41,10 +42,7 @@ class WorldLink:
             file.truncate(IMAGE_BYTES)
             self._images = mmap.mmap(file.fileno(), IMAGE_BYTES)
             fds = (theirs.fileno(), file.fileno())
-            command = module_command("simbackend.world_process", *map(str, fds))
-            self.process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                command, pass_fds=fds, env=_environment(), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-            )
+            self.process = start_module("simbackend.world_process", fds, ONE_THREAD)
         theirs.close()
         self._pipe = Connection(ours.detach())
         self._stream = self._pipe.fileno()
@@ -159,8 +157,3 @@ def _vector(op: Op, *arguments: float) -> bytes:
     request[0] = op
     request[1 : 1 + len(arguments)] = arguments
     return request.tobytes()
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment that limits the world to one core, because the other is for the cell."""
-    return {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")}

@@ -52,8 +52,8 @@ def roles_of(pid: int) -> dict[str, Process]:
     for one, process in family.items():
         words = _command(one)
         for role, module in MODULES.items():
-            if module in words:
-                roles[role] = process
+            if module in words and (role not in roles or process.began < roles[role].began):
+                roles[role] = process  # a world that the cell forked has the words of the cell
     if pid in family:
         roles["service"] = family[pid]
     if "cell" in roles:

@@ -23,6 +23,7 @@ from hal.isolated import Report, isolated_device
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from hal.simulated import Fault
+from hal.spare_process import drop_spare, keep_spare
 from hal.strict import validate
 from service.errors import DevicesUnavailable
 from service.knowledge.calibrations import Calibrations
@@ -259,6 +260,9 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     sys.setswitchinterval(SWITCH_S)
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
+    import hal.jit  # noqa: F401 - the simulated world needs it too, and takes it from here
+
+    keep_spare()  # before any thread begins
     lifeline = Lifeline()
     _in_background(_import_control)
     line = lifeline.read_line()
@@ -295,6 +299,7 @@ def _run(
         report=lambda kind, data: lifeline.write_line(note_to_line(kind, data)),
         record=None if order.record is None else Endpoint(*order.record),
     )
+    drop_spare()
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     freeze_loaded()
     vigil.watch(runtime.why_ended)

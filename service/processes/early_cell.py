@@ -12,13 +12,18 @@ from pathlib import Path
 from service.processes.child import Child
 from service.processes.runtime_folder import RuntimeFolder
 
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+)  # neither cell nor world multiplies large matrices
+
 
 def begin_cell(folder: Path, on_line: Callable[[str], None], on_exit: Callable[[int], None]) -> Child:
     """Start a cell process, which waits for its order.
 
     Its temporary files lie in `folder`, so that nothing remains of one that is killed.
     """
-    return Child("service.processes.cell", environment={"TMPDIR": str(folder)}, on_line=on_line, on_exit=on_exit)
+    environment = {"TMPDIR": str(folder), **ONE_THREAD}
+    return Child("service.processes.cell", environment=environment, on_line=on_line, on_exit=on_exit)
 
 
 class EarlyCell:

@@ -80,18 +80,22 @@ def until(page: Page, claim: str, *, every_ms: float = 20.0) -> None:
 
 
 @contextmanager
-def served(cell: Path) -> Iterator[Served]:
+def served(cell: Path, *, runs: Path | None = None) -> Iterator[Served]:
     """Start the real service with its console, wait until both answer, and end them.
 
     The cell is served as it is, but half of its readings wait for a person, so that there is something to review.
+
+    Args:
+        runs: folder of its reports and its history; None for one of its own.
     """
     with tempfile.TemporaryDirectory() as folder:
         text = cell.read_text(encoding="utf-8")
-        for name in ("panels", "cells"):
-            (Path(folder) / name).symlink_to(ROOT / name)
+        for name in ("panels", "cells", "missions"):
+            (Path(folder) / name).symlink_to(cell.resolve().parents[1] / name)
         own = Path(folder) / "cell.toml"
-        own.write_text(f"{text}\n[review]\naudit_share = 0.5\n", encoding="utf-8")
-        runs = Path(folder) / "runs"
+        review = "" if "[review]" in text else "\n[review]\naudit_share = 0.5\n"
+        own.write_text(text + review, encoding="utf-8")
+        runs = Path(folder) / "runs" if runs is None else runs
         command = [sys.executable, "-m", "service.cli", "serve", "--cell", str(own), "--port", "0", "--runs", str(runs)]
         command += ["--console-port", "0"]
         with subprocess.Popen(

@@ -43,7 +43,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import alarms, calibrate, devices, init, keys, missions, review, rounds, serve, tasks
+    from service.commands import alarms, calibrate, devices, init, keys, missions, panel, review, rounds, serve, tasks
     from service.commands.backup import backup, restore
     from service.commands.certify import certify
     from service.commands.chaos import chaos
@@ -56,6 +56,7 @@ def _app() -> Callable[[], None]:
     from service.commands.history import history
     from service.commands.journal import journal
     from service.commands.learn import learn
+    from service.commands.objects import inspect, set_object
     from service.commands.range import batch, range_image
     from service.commands.read import read
     from service.commands.record import record, replay
@@ -68,7 +69,6 @@ def _app() -> Callable[[], None]:
     app = typer.Typer(
         no_args_is_help=True,
         pretty_exceptions_enable=False,
-        add_completion=False,
     )
 
     app.callback()(root)
@@ -81,10 +81,10 @@ def _app() -> Callable[[], None]:
     app.command()(drivers)
     app.add_typer(tasks.app, name="task")
     app.add_typer(missions.app, name="mission")
-    app.command()(tasks.stop)
-    app.command()(journal)
-    app.command()(history)
-    app.command()(report)
+    app.add_typer(panel.app, name="panel")
+    for command in (tasks.stop, inspect, journal, history, report):
+        app.command()(command)
+    app.command("set")(set_object)
     app.add_typer(alarms.app, name="alarms")
     app.add_typer(rounds.app, name="rounds")
     app.add_typer(review.app, name="review")

@@ -29,7 +29,8 @@ __all__ = [
     "use_key_file",
 ]
 
-Url = Annotated[str, typer.Option("--url", help="Address of a running service.", show_default=True)]
+URL_FROM = "PANELWRIGHT_URL"  # of the environment
+Url = Annotated[str, typer.Option("--url", envvar=URL_FROM, help="Address of a running service.", show_default=True)]
 CellOption = Annotated[
     Path, typer.Option("--cell", help="Cell file (TOML); shipped ones are found by their path in the project.")
 ]

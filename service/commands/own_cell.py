@@ -10,12 +10,15 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from service.client import ApiError, Client
-from service.commands.common import client_of, console, read_cell
+from service.commands.common import URL_FROM, client_of, console, read_cell
 from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.tasks import follow
 from service.commands.warm import compile_first
 
-ServiceUrl = Annotated[str | None, typer.Option("--url", help="Use this running service instead of starting the cell.")]
+ServiceUrl = Annotated[
+    str | None,
+    typer.Option("--url", envvar=URL_FROM, help="Use this running service instead of starting the cell."),
+]
 
 
 def run_task(client: Client, path: str, request: dict[str, Any]) -> dict[str, Any]:

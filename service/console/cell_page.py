@@ -15,6 +15,9 @@ from service.console.poses import base_from, frames_of, lens_of
 from service.console.texts import say
 from service.console.values import attribute
 
+FIELD_DEG = 48.0
+GRID = (4, 40)  # side, m, and divisions
+SKY = "#eef2f5"
 FRUSTUM_M = 0.35
 JOINT_M, LINK_M = 0.05, 0.04  # for the eye; the planner has its own radii
 SIGMAS_SHOWN = 3.0 * 10.0  # three standard deviations, ten times enlarged
@@ -30,8 +33,9 @@ def install(place: Place) -> None:
         with page_frame(place, "cell"), ui.element("section").classes("card"):
             ui.html(say("cell.heading"), sanitize=False, tag="h2")
             with ui.element("div").props(f'role="img" aria-label="{attribute(say("cell.scene"))}"'):
-                scene = ui.scene(width=1000, height=512, background_color="#eef2f5").classes("scene")
-            scene.move_camera(x=-0.15, y=-1.15, z=1.05, look_at_x=0.5, look_at_y=0.0, look_at_z=0.55, duration=0)
+                lens = ui.scene.perspective_camera(fov=FIELD_DEG)
+                scene = ui.scene(width=1000, height=512, grid=GRID, camera=lens, background_color=SKY).classes("scene")
+            scene.move_camera(x=-0.75, y=-1.35, z=1.35, look_at_x=0.5, look_at_y=0.0, look_at_z=0.5, duration=0)
             drawn = _Drawn(scene, mirror)
             ui.timer(0.1, drawn.renew)
             live(ui.html("", sanitize=False, tag="p"), lambda: _pose_line(mirror))

@@ -37,7 +37,7 @@ def install(place: Place) -> None:
             with ui.element("section").classes("card"):
                 ui.html(say("history.reports"), sanitize=False, tag="h2")
                 search = _Search(mirror)
-                live(ui.html("", sanitize=False), search.found)
+                live(ui.html("", sanitize=False).classes("long"), search.found)
 
 
 class _Trends:
@@ -60,7 +60,7 @@ class _Trends:
         with ui.element("div").props(f'role="img" aria-label="{attribute(say("history.chart"))}"'):
             self._chart = ui.echart({}, on_point_click=self._clicked).style("height:24rem;width:100%")
         self._picture = ui.html("", sanitize=False).props("aria-live=polite")
-        live(ui.html("", sanitize=False), self._table)
+        live(ui.html("", sanitize=False).classes("long"), self._table)
         ui.timer(0.1, self._begin, once=True)
 
     async def _begin(self) -> None:

@@ -185,9 +185,8 @@ class Mirror:
         self._keep("history", {**before, "newest": list(newest.values())})
 
     def _keep(self, topic: str, answer: Any) -> None:
-        if self._said.get(topic) != answer:
-            self.version += 1
-            self._said[topic] = answer
+        self.version += self._said.get(topic) != answer
+        self._said[topic] = answer
 
     def _topics_due(self, now_s: float) -> list[str]:
         return [

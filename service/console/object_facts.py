@@ -17,9 +17,11 @@ def facts_html(one: PanelObject, reading: Reading | None, alarm: dict[str, Any] 
     parts = [f"<h2>{attribute(label_of(one))} <span class='quiet'>{attribute(one.kind.replace('_', ' '))}</span></h2>"]
     value = shown(one, reading)
     parts.append(f'<p style="font-size:1.7rem;margin:.2rem 0"><b id="dialog-value">{attribute(value)}</b> ')
-    parts.append(
-        f'<span class="quiet">{attribute(sigma(one, reading))} {confidence(reading)} {age(reading)}</span></p>'
-    )
+    sure = confidence(reading)
+    facts = [sigma(one, reading), say("object.confidence", share=sure) if sure else ""]
+    told = " · ".join(attribute(fact) for fact in facts if fact)
+    aged = say("object.age", age=age(reading)) if reading is not None else ""
+    parts.append(f'<span class="quiet">{" · ".join(part for part in (told, aged) if part)}</span></p>')
     if reading is not None:
         if reading["quality"] != "valid":
             parts.append(f'<p class="warn">{attribute(say("object.refused", cause=reading["cause"]))}</p>')

@@ -28,6 +28,7 @@ PATHS = {
     "setup": "/setup",
     "cell": "/cell",
 }
+CALLING = ("unacknowledged", "returned-unacknowledged")  # states of alarms that call for a person
 REFRESH_S = 0.25
 LOOK_S = 0.05  # so soon does a page show what the service said
 AT_LEAST_S = 2.0  # so often it is put together again, because time passes
@@ -60,14 +61,11 @@ def page_frame(place: Place, current: str) -> Iterator[None]:
     ui.add_body_html(stop_box(place, may_reset=mirror.may(Role.OPERATOR)))
     with ui.element("div").classes("top"):
         heading = ui.html("", sanitize=False)
-        links = "".join(
-            f'<a href="{path}"{" aria-current=page" if name == current else ""}>{say(f"nav.{name}")}</a>'
-            for name, path in PATHS.items()
-        )
-        ui.html(links, sanitize=False, tag="nav").props(f'aria-label="{say("nav")}"')
+        ways = ui.html("", sanitize=False, tag="nav").props(f'aria-label="{say("nav")}"')
     with ui.element("div").classes("main"):  # NiceGUI lays it out inside of its own <main>
         banner = ui.html("", sanitize=False).classes("banner").props("role=alert")
         yield
+    live(ways, lambda: _ways(mirror, current), of=mirror)
     live(heading, lambda: _heading(mirror), of=mirror)
     live(banner, lambda: trouble(mirror), of=mirror)
 
@@ -176,6 +174,18 @@ def clock(seconds: float | None) -> str:
     moment = time.localtime(seconds)
     is_today = moment[:3] == time.localtime()[:3]
     return time.strftime("%H:%M:%S" if is_today else "%Y-%m-%d %H:%M", moment)
+
+
+def _ways(mirror: Mirror, current: str) -> str:
+    """Return the links to all pages, with the number of alarms that nobody has acknowledged."""
+    alarms = mirror.said("alarms", {"alarms": []})["alarms"]
+    calling = sum(one["state"] in CALLING for one in alarms)
+    mark = f' <b class="count" title="{say("nav.calling")}">{calling}</b>' if calling else ""
+    return "".join(
+        f'<a href="{path}"{" aria-current=page" if name == current else ""}>{say(f"nav.{name}")}'
+        f"{mark if name == 'alarms' else ''}</a>"
+        for name, path in PATHS.items()
+    )
 
 
 def _heading(mirror: Mirror) -> str:

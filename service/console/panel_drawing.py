@@ -51,6 +51,7 @@ def _object(one: PanelObject, reading: Reading | None, alarm: Mapping[str, Any] 
     x, y = _px(one.position_m)
     half_w, half_h = (size * PX_PER_M for size in one.half_footprint_m)
     label, value = label_of(one), shown(one, reading)
+    seen = "–" if reading is None else value  # the list below says in words that nobody has read it
     mark = "var(--bad)" if alarm is not None and alarm["is_active"] else "var(--ink)"
     refused = reading is not None and reading["quality"] != "valid"
     words = "var(--warn)" if refused else mark
@@ -67,7 +68,7 @@ def _object(one: PanelObject, reading: Reading | None, alarm: Mapping[str, Any] 
         f'<g transform="translate({x:.1f} {y:.1f})" data-object="{one.name}" {row} role="button" tabindex="0" '
         f'aria-label="{attribute(say("open", label=label, value=value))}">'
         f"{_foot(one, half_w, half_h, mark)}{_pointer(one, reading, half_w, half_h, mark)}{name}"
-        f"{text.format(y=below, style=style, words=attribute(value))}</g>"
+        f"{text.format(y=below, style=style, words=attribute(seen))}</g>"
     )
 
 

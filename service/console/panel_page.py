@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.panel import PanelObject
 from service.console.mirror import Mirror
-from service.console.mission_words import is_plan
+from service.console.mission_words import is_plan, name_of
 from service.console.object_dialog import ObjectDialog
 from service.console.page_frame import Place, clock, live, page_frame, picks, table
 from service.console.panel_drawing import overlay_svg, panel_svg
@@ -63,11 +63,10 @@ def _row(one: PanelObject, reading: Reading | None, alarm: dict[str, Any] | None
     value = shown(one, reading)
     why = reading["cause"] if reading is not None and reading["quality"] != "valid" else sigma(one, reading)
     row = f' data-row="{reading["utc_s"]:.1f}"' if reading is not None else ""
-    says = (
-        ""
-        if alarm is None
-        else f'<span class="{"bad" if alarm["is_active"] else "warn"}">{attribute(alarm["says"])}</span>'
-    )
+    says = ""
+    if alarm is not None:
+        told = alarm["says"] if alarm["is_active"] else f"{word('alarm', alarm['state'])}: {alarm['says']}"
+        says = f'<span class="{"bad" if alarm["is_active"] else "warn"}">{attribute(told)}</span>'
     return (
         f'<tr{row}><td><button type="button" class="name" data-object="{one.name}">{attribute(label_of(one))}</button></td>'
         f'<td><b>{attribute(value)}</b> <span class="quiet">{attribute(why)}</span></td>'
@@ -91,7 +90,8 @@ def last_mission(mirror: Mirror) -> str:
         )
     for action in result.get("actions", []):
         look = "good" if action["confirmed"] else "bad"
-        told = f"{action['object']}: {action['before']} → {action['after'] or '–'}"
+        label = name_of(mirror.panel, action["object"])
+        told = say("last.action", label=label, before=action["before"], after=action["after"] or "–")
         parts.append(f'<p class="{look}">{attribute(told)}</p>')
     if link:
         parts.append(

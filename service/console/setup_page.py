@@ -26,6 +26,7 @@ class Check:
         fix: the next step; empty if nothing is missing.
         label, path, body: a button that takes the step: its label, where it posts to, and with what; a `path` that
             begins with `page:` is opened instead.
+        again: label of the button while nothing is missing, for a step that may be taken again; empty for the others.
     """
 
     what: str
@@ -33,6 +34,7 @@ class Check:
     label: str = ""
     path: str = ""
     body: Any = None
+    again: str = ""
 
 
 def install(place: Place) -> None:
@@ -62,13 +64,15 @@ def install(place: Place) -> None:
 def _listed(found: list[Check], *, may_take: bool) -> str:
     missing = [check for check in found if check.fix]
     line = say("setup.next", step=missing[0].fix) if missing else say("setup.ready")
-    parts = [f'<p role="status"><b>{attribute(line)}</b></p><table class="list"><tbody>']
+    parts = [f'<p role="status"><b>{attribute(line)}</b></p><table class="list checks"><tbody>']
     for k, check in enumerate(found):
         state = f'<span class="chip {"warn" if check.fix else "good"}">{say("setup.missing" if check.fix else "setup.ok")}</span>'
         step = ""
         if check.fix and check.path and (may_take or check.path.startswith("page:")):
             is_next = check is missing[0]
             step = f'<button type="button" class="{"do" if is_next else "plain"}" data-step="{k}">{attribute(check.label)}</button>'
+        elif check.again and may_take:
+            step = f'<button type="button" class="plain" data-step="{k}">{attribute(check.again)}</button>'
         fix = f'<br><span class="quiet">{attribute(check.fix)}</span>' if check.fix else ""
         parts.append(f"<tr><td>{state}</td><td>{attribute(check.what)}{fix}</td><td>{step}</td></tr>")
     return "".join([*parts, "</tbody></table>"])
@@ -103,6 +107,7 @@ def checks(mirror: Mirror) -> Iterator[Check]:
         what=say("setup.locate"),
         fix="" if is_located else say("setup.locate.fix"),
         label=say("setup.locate.do"),
+        again=say("setup.locate.again"),
         path="/v1/panel-pose",
         body={},
     )

@@ -151,14 +151,14 @@ def _series(trend: Trend, colour: str, axis: int) -> Iterator[dict[str, Any]]:
         "symbolSize": 9,
         "lineStyle": {"color": colour},
         "data": [[1e3 * point.at_s, round(point.value, 6)] for point in trend.points],
-        "markLine": {"symbol": "none", "silent": True, "data": list(_limits(one, colour))},
+        "markLine": {"symbol": "none", "silent": True, "data": list(_limits(one, colour, is_left=axis % 2 == 1))},
     }
 
 
-def _limits(one: PanelObject, colour: str) -> Iterator[dict[str, Any]]:
+def _limits(one: PanelObject, colour: str, *, is_left: bool) -> Iterator[dict[str, Any]]:
     for name, value in one.limits.given.items() if one.limits is not None else ():
         told = say("history.limit", label=label_of(one), limit=name.replace("_", "-"))
-        label = {"formatter": told, "position": "insideEndTop", "color": INK}
+        label = {"formatter": told, "position": "insideStartTop" if is_left else "insideEndTop", "color": INK}
         yield {"yAxis": _factor(one) * value, "label": label, "lineStyle": {"color": colour, "type": "dashed"}}
 
 

@@ -57,17 +57,14 @@ class Inspection:
     pictures: tuple[AnnotatedView, ...]
     offset_m: float = 0.0
 
-    def crops(self, *, is_upright: bool = False) -> dict[str, bytes]:
-        """Return a picture (PNG) of each object, from the last image in which it was read, else from the first.
-
-        It is turned as the camera stood, for programs, or upright for people.
-        """
+    def crops(self) -> dict[str, bytes]:
+        """Return an upright picture (PNG) of each object, from the last image in which it was read, else from the first."""
         shown: dict[str, bytes] = {}
         for picture in self.pictures:
             for reading in picture.readings:
                 cut = cut_out(picture.look.pixels, reading.outline_px)
                 if cut is not None and (reading.name not in shown or reading.answered):
-                    shown[reading.name] = png_of(turned_image(cut, picture.turns if is_upright else 0))
+                    shown[reading.name] = png_of(turned_image(cut, picture.turns))
         return shown
 
 

@@ -289,7 +289,7 @@ class _Eye:
         record = self._session.record
         mission = "" if record is None else record.mission
         if record is not None:
-            record.crops |= found.crops(is_upright=True)
+            record.crops |= found.crops()
         self._session.observer.saw([reading], found.crops(), mission=mission, phase=self._at)
         return reading if reading.present and reading.answered else None
 

@@ -379,7 +379,7 @@ def _note_depths(session: Session, record: MissionRecord, rims: Sequence[SeenRim
 def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:
     for k, picture in enumerate(found.pictures):
         record.pictures.append(Picture(name=f"{name}-{k}", title=picture.title, png=png_of(picture.pixels)))
-    record.crops |= found.crops(is_upright=True)
+    record.crops |= found.crops()
 
 
 def _places(session: Session, found: Inspection) -> list[ObjectPlace]:

@@ -10,6 +10,7 @@ from hal.panel.limits import Limits
 from tests.service.browser import NEEDS_CHROMIUM
 from tests.service.console.served import Cell, leave_mission, until
 from tests.service.history.test_store import reading
+from tests.service.waiting import eventually
 
 pytestmark = NEEDS_CHROMIUM
 
@@ -78,9 +79,13 @@ def test_a_point_of_the_trend_shows_its_reading_and_reports_are_searched(page: A
     until(page, "document.querySelector('tbody').textContent.includes('33.5 %')")
     chart = "getElement(Number(document.querySelector('.nicegui-echart').id.slice(1))).chart"
     until(page, f"{chart}.getOption().series[2].data.at(-1)[1] === 33.5")
-    x, y = page.evaluate(f"{chart}.convertToPixel({{seriesIndex: 2}}, {chart}.getOption().series[2].data.at(-1))")
-    page.click(".nicegui-echart", position={"x": x, "y": y})
-    until(page, "document.querySelector('.main').textContent.includes(': 33.5')")
+
+    def is_clicked() -> bool:  # the chart may still be laid out when the first click comes
+        x, y = page.evaluate(f"{chart}.convertToPixel({{seriesIndex: 2}}, {chart}.getOption().series[2].data.at(-1))")
+        page.click(".nicegui-echart", position={"x": x, "y": y})
+        return ": 33.5" in page.inner_text(".main")
+
+    eventually(is_clicked)
     leave_mission(cell.service.service.runs_dir / "20260102T000000-a", done=["read", "feel"])
     until(page, "document.querySelector('.main').textContent.includes('1 of 1 reports')")
     page.fill("input[aria-label=Object]", "nothing of that name")

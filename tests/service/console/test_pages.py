@@ -20,7 +20,7 @@ PAGES = ("/", "/missions", "/rounds", "/alarms", "/review", "/history", "/device
 
 
 def test_the_panel_shows_and_a_new_reading_appears_by_itself(page: Any, cell: Cell) -> None:
-    until(page, "document.querySelector('[data-object=pump_lamp] .value').textContent === 'not read yet'")
+    until(page, "document.querySelector('[data-object=pump_lamp] .value').textContent === '–'")
     cell.record(41.5)
     until(page, "document.querySelector('[data-object=setpoint] .value').textContent === '41.5 %'")
     until(page, "document.querySelector('tr time').textContent.endsWith(' s')")

@@ -1,0 +1,104 @@
+"""Renews the pictures of the console's pages: `python -m benchmarks.console_pictures [--runs FOLDER] [--out docs/images/console]`.
+
+Starts the real service on the simulated bench cell, runs the demo mission, and takes each page in headless Chromium. Those of the
+documentation show a week: `panelwright demo --week`, then `--runs runs/week --cell runs/week/plant/cells/bench.toml`. `--all` takes
+each page in light and dark, 1440 and 390 pixels wide.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from playwright.sync_api import Page, sync_playwright
+
+from benchmarks.console_served import Served, new_page, served, until
+from tests.service.browser import CHROMIUM, FLAGS
+
+ROOT = Path(__file__).resolve().parents[1]
+SHOWN = (("", 1440, 900, "light"), ("-telephone", 390, 844, "dark"))
+OTHERS = (("-dark", 1440, 900, "dark"), ("-telephone-light", 390, 844, "light"))
+QUALITY = 70
+SETTLE_MS = 2500.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Take the pictures and print their sizes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs/images/console")
+    parser.add_argument("--runs", type=Path, help="folder of an earlier service, whose history is shown")
+    parser.add_argument("--only", default=",".join(PICTURES))
+    parser.add_argument("--all", action="store_true", help="every page in every look")
+    parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    with served(given.cell, runs=given.runs) as service, sync_playwright() as play:
+        if given.runs is None:
+            service.end("/v1/missions", {"file": "demo"})
+        else:
+            service.end("/v1/panel-pose", {})
+        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        for name in given.only.split(","):
+            path, prepare = PICTURES[name]
+            for suffix, width, height, scheme in (*SHOWN, *OTHERS) if given.all else SHOWN:
+                page = new_page(browser, width=width, height=height, scheme=scheme)
+                page.goto(service.console_url + path)
+                until(page, "document.querySelector('.top .quiet').textContent.includes('panel')")
+                prepare(page, service)
+                page.wait_for_timeout(SETTLE_MS)
+                _write(page, given.out / f"{name}{suffix}.webp", whole=given.all)
+                page.context.close()
+        browser.close()
+    return 0
+
+
+def _write(page: Page, path: Path, *, whole: bool) -> None:
+    pixels = cv2.imdecode(np.frombuffer(page.screenshot(full_page=whole), np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None  # the browser wrote it
+    cv2.imwrite(str(path), pixels, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
+
+
+def _nothing(_page: Page, _service: Served) -> None:
+    """Show the page as it opens."""
+
+
+def _drawn(page: Page, _service: Served) -> None:
+    until(page, "document.querySelector('img[data-source]').naturalWidth > 0")
+
+
+def _opened(page: Page, _service: Served) -> None:
+    page.click("g[data-object=pressure]")
+    until(page, "document.querySelector('.dialog svg, .dialog .crops') !== null")
+
+
+def _planned(page: Page, _service: Served) -> None:
+    page.click("[data-mission=inspect]")
+    page.click("button:text-is('Dry run'):not([disabled])")
+    until(page, "document.querySelector('.main').textContent.includes('Plan of')")
+
+
+def _several(page: Page, _service: Served) -> None:
+    until(page, "document.querySelector('.nicegui-echart canvas') !== null")
+    page.click("button[data-object=temperature]")
+    until(page, "document.querySelector('tbody').textContent.includes('TEMPERATURE')")
+
+
+PICTURES: dict[str, tuple[str, Callable[[Page, Served], None]]] = {
+    "panel": ("/", _drawn),
+    "object": ("/", _opened),
+    "missions": ("/missions", _planned),
+    "rounds": ("/rounds", _nothing),
+    "alarms": ("/alarms", _nothing),
+    "review": ("/review", _nothing),
+    "history": ("/history?object=pressure", _several),
+    "devices": ("/devices", _nothing),
+    "setup": ("/setup", _nothing),
+    "cell": ("/cell", _nothing),
+}
+
+if __name__ == "__main__":
+    raise SystemExit(main())

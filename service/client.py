@@ -18,7 +18,7 @@ from hal.errors import CellError, ConfigError, DeviceUnavailable, Retry, detail_
 DEFAULT_URL = "http://127.0.0.1:8460"
 # Commands that address a service; those that name their service or their own cell, or only read files, do not count.
 TALKING = re.compile(
-    r"`panelwright (?:devices(?! (?:record|replay)\b)|task|stop|learn|history|foxglove|alarms|rounds|review|certify"
+    r"`panelwright (?:devices(?! (?:record|replay)\b)|task|stop|inspect|set|learn|history|foxglove|alarms|rounds|review|certify"
     r"|mission (?:run|resume)|calibrate (?:camera|hand-eye|scanner|tool|list))(?![\w-])"
     r"(?![^`]*--(?:url|cell)\b)[^`]*(?=`)"
 )

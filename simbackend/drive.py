@@ -113,14 +113,14 @@ class GripperDrive:
         self._force_n, self._speed_m_per_s = force_n, speed_m_per_s
         self.is_moving, self.is_holding = True, False
 
-    def tick(self, pad_force_n: tuple[float, float]) -> None:
+    def tick(self, pad_force_n: tuple[float, ...]) -> None:
         """Move the screw by one tick."""
         self.speed = 0.0
         if not self.is_moving:
             return
         gap_m = self._target_m - self.width_m
         # One screw drives both pads, so it is loaded by the mean of their forces.
-        if gap_m < 0.0 and sum(pad_force_n) / 2.0 >= self._force_n:
+        if gap_m < 0.0 and sum(pad_force_n) / len(pad_force_n) >= self._force_n:
             self.is_moving, self.is_holding = False, True
             return
         step_m = self._speed_m_per_s * self.dt_s

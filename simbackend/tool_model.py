@@ -17,9 +17,10 @@ MAX_SPEED_M_PER_S = 0.15
 FINGER_THICKNESS_M = 0.007
 FINGER_WIDTH_M = 0.012
 FINGER_LENGTH_M = 0.075
-PAD_STIFFNESS_N_PER_M = 5_000.0  # 20 kN/m raised the lever's peak force from 71 to 114 N in the prototype
-PAD_DAMPING_N_S_PER_M = 100.0
 FINGER_MASS_KG = 0.04
+ROOT_MASS_KG = 0.002  # of each of the three parts between gripper and finger
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # along which a finger gives way
+GIVE_LIMITS_M = (-0.02, 0.02)
 SENSOR_MASS_KG = 0.01  # the part of the sensor below its measuring element
 DARK = (0.18, 0.18, 0.20)
 STEEL = (0.55, 0.57, 0.60)
@@ -46,14 +47,33 @@ def tool_urdf(*, flange_from_sensor: RigidTransform, flange_from_grip: RigidTran
     )
     lines += joint("gripper", "fixed", "sensor", "gripper", sensor_from_grip)
     for name, side in (("left", -1.0), ("right", 1.0)):
-        middle = at(side * FINGER_THICKNESS_M / 2.0, 0.0, -FINGER_LENGTH_M / 2.0)
-        lines += link(
-            f"finger_{name}",
-            inertial(FINGER_MASS_KG, (side * FINGER_THICKNESS_M / 2.0, 0, -FINGER_LENGTH_M / 2.0), (2e-5, 2e-5, 5e-6)),
-            shape(middle, box((FINGER_THICKNESS_M, FINGER_WIDTH_M, FINGER_LENGTH_M)), STEEL),
-        )
         limits = (-0.002, MAX_WIDTH_M / 2.0 + 0.002)
-        lines += joint(
-            f"finger_{name}", "prismatic", "gripper", f"finger_{name}", at(0, 0, 0), axis=(side, 0, 0), limits=limits
-        )
+        lines += _slide(f"finger_{name}", "gripper", f"carriage_{name}", axis=(side, 0, 0), limits=limits)
+        lines += link(f"carriage_{name}", _lump(ROOT_MASS_KG))
+        parent = f"carriage_{name}"
+        for letter, axis in AXES.items():
+            child = f"finger_{name}" if letter == "z" else f"root_{letter}_{name}"
+            lines += _slide(f"give_{letter}_{name}", parent, child, axis=axis, limits=GIVE_LIMITS_M)
+            lines += link(child, *([_lump(ROOT_MASS_KG)] if letter != "z" else _finger(side)))
+            parent = child
     return lines
+
+
+def _finger(side: float) -> list[list[str]]:
+    """Return mass and shape of a finger."""
+    middle = (side * FINGER_THICKNESS_M / 2.0, 0.0, -FINGER_LENGTH_M / 2.0)
+    geometry = box((FINGER_THICKNESS_M, FINGER_WIDTH_M, FINGER_LENGTH_M))
+    return [
+        inertial(FINGER_MASS_KG - 3.0 * ROOT_MASS_KG, middle, (2e-5, 2e-5, 5e-6)),
+        shape(at(*middle), geometry, STEEL),
+    ]
+
+
+def _slide(
+    name: str, parent: str, child: str, *, axis: tuple[float, float, float], limits: tuple[float, float]
+) -> list[str]:
+    return joint(name, "prismatic", parent, child, at(0, 0, 0), axis=axis, limits=limits)
+
+
+def _lump(mass_kg: float) -> list[str]:
+    return inertial(mass_kg, (0, 0, -FINGER_LENGTH_M / 2.0), (1e-6, 1e-6, 1e-6))

@@ -20,8 +20,9 @@ from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
 from simbackend.contact_log import ContactLog
 from simbackend.draws import Draws
 from simbackend.drive import ArmDrive, GripperDrive
+from simbackend.pads import Pads, Roots
 from simbackend.panel_world import ARM_GROUP, PANEL_GROUP, PanelWorld
-from simbackend.tool_model import PAD_DAMPING_N_S_PER_M, PAD_STIFFNESS_N_PER_M
+from simbackend.tool_model import AXES
 from simbackend.wire import (
     GRIPPER_AT,
     JOINTS_AT,
@@ -56,7 +57,6 @@ class World:
         self.draws = Draws(self.cell.file.cell.seed)
         self.tick = 0
         self._begun: dict[int, RigidTransform] = {}  # base_from_panel when an event began
-        self.pad_force_n = (0.0, 0.0)
         self.engine: Any = pybullet
         pybullet.connect(pybullet.DIRECT)
         pybullet.setPhysicsEngineParameter(
@@ -95,32 +95,30 @@ class World:
         index = {engine.getJointInfo(self.arm, i)[1].decode(): i for i in range(engine.getNumJoints(self.arm))}
         self.joints = [index[f"link{i + 1}"] for i in range(len(self.model.capabilities.links))]
         self.fingers = [index["finger_left"], index["finger_right"]]
-        self.moving = [*self.joints, *self.fingers]
+        self.driven = [*self.joints, *self.fingers]
+        gives = [[index[f"give_{axis}_{side}"] for axis in AXES] for side in ("left", "right")]
+        self.moving = [*self.joints, self.fingers[0], *gives[0], self.fingers[1], *gives[1]]  # in the engine's order
         self.sensor, self.flange_link = index["sensor"], index["flange"]
         self.flange_from_grip = mounts["gripper"]
         self.gripper_link = index["gripper"]
         for i in range(-1, engine.getNumJoints(self.arm)):
             engine.changeDynamics(self.arm, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
             engine.setCollisionFilterGroupMask(self.arm, i, ARM_GROUP, PANEL_GROUP)
-        for finger in self.fingers:
-            engine.changeDynamics(
-                self.arm,
-                finger,
-                lateralFriction=self.cell.file.simulation.pad_friction,
-                contactStiffness=PAD_STIFFNESS_N_PER_M,
-                contactDamping=PAD_DAMPING_N_S_PER_M,
-            )
+        self.pads = Pads(
+            engine, self.arm, [side[-1] for side in gives], friction=self.cell.file.simulation.pad_friction
+        )
         engine.enableJointForceTorqueSensor(self.arm, self.sensor, 1)
         park = np.asarray(self.cell.file.workspace.park_rad, float)
         self.drive = ArmDrive(self.model.capabilities, park, self.dt_s, lookahead_s=self.config.lookahead_s)
         is_rigid = self.cell.file.hand.fingers == 1  # the two fingers stay together as one
         self.gripper = GripperDrive(self.dt_s, width_m=0.0, _target_m=0.0) if is_rigid else GripperDrive(self.dt_s)
         places = [*park, self.gripper.width_m / 2, self.gripper.width_m / 2]
-        for joint, place in zip(self.moving, places, strict=True):
+        for joint, place in zip(self.driven, places, strict=True):
             engine.resetJointState(self.arm, joint, place)
+        self.roots = Roots(engine, self.arm, [*gives[0], *gives[1]], dt_s=self.dt_s)
         self._forces = [*self.model.torque_nm, FINGER_FORCE_N, FINGER_FORCE_N]
         self._gains = [ARM_GAIN] * len(self.joints) + [FINGER_GAIN] * 2
-        self._damps = [1.0] * len(self.moving)
+        self._damps = [1.0] * len(self.driven)
         self._zeros = [0.0] * len(self.moving)
 
     def _true_mount(self, device: str) -> RigidTransform:
@@ -180,14 +178,17 @@ class World:
     def _advance(self) -> None:
         engine = self.engine
         self.drive.tick()
-        self.gripper.tick(self.pad_force_n)
+        self.gripper.tick(self.pads.force_n)
         half, pad_speed = self.gripper.width_m / 2, self.gripper.speed / 2
         # Gravity torque is added to the position motor: the servo sags by 2 to 12 mrad without it and by 1e-16 with it.
-        gravity = engine.calculateInverseDynamics(self.arm, self.q, self._zeros, self._zeros)
-        engine.setJointMotorControlArray(self.arm, self.moving, engine.TORQUE_CONTROL, forces=gravity)
+        efforts = list(engine.calculateInverseDynamics(self.arm, self.q, self._zeros, self._zeros))
+        first = len(self.joints)
+        for k in (*range(first + 1, first + 4), *range(first + 5, first + 8)):
+            efforts[k] = self.roots.force_n(self.q[k], self.v[k])
+        engine.setJointMotorControlArray(self.arm, self.moving, engine.TORQUE_CONTROL, forces=efforts)
         engine.setJointMotorControlArray(
             self.arm,
-            self.moving,
+            self.driven,
             engine.POSITION_CONTROL,
             targetPositions=[*self.drive.setpoint.tolist(), half, half],
             targetVelocities=[*self.drive.speed.tolist(), pad_speed, pad_speed],
@@ -217,16 +218,11 @@ class World:
 
     def _read_contacts(self) -> None:
         contacts = self.engine.getContactPoints(bodyA=self.arm)
-        if not contacts:
-            self.pad_force_n = (0.0, 0.0)
+        self.pads.note(contacts)
+        if contacts:
+            self._forces_on.note(contacts)
+        else:
             self._forces_on.nothing()
-            return
-        pads = [0.0, 0.0]
-        for contact in contacts:
-            if contact[3] in self.fingers:
-                pads[self.fingers.index(contact[3])] += contact[9]
-        self.pad_force_n = (pads[0], pads[1])
-        self._forces_on.note(contacts)
 
     def snapshot(self) -> Array:
         """Return the vector whose parts `Snapshot` names."""
@@ -243,8 +239,8 @@ class World:
                 *self.drive.setpoint.tolist(),
                 *spare,
                 *reaction,
-                *self.pad_force_n,
-                *(self.q[joints] + self.q[joints + 1], self.gripper.is_moving, self.gripper.is_holding, 0.0),
+                *self.pads.force_n,
+                *(self.q[joints] + self.q[joints + 4], self.gripper.is_moving, self.gripper.is_holding, 0.0),
                 *self.panel.lights_on,
                 *[0.0] * (LIGHTS - len(self.panel.lights_on)),
                 *self._proximity,

@@ -79,9 +79,17 @@ class SetPointLimiter:
         return out
 
     def brake(self) -> Array:
-        """Return the set-point of a tick that only slows down, each joint as fast as its limit allows."""
-        self._wanted_rad[:] = self.last_rad
-        return self._step(self.last_rad)
+        """Return the set-point of a tick that only slows down, along the way on which the joints are.
+
+        All joints slow down by the same share, as much as the limit of one of them allows. If each stopped as fast as it
+        could, the tip would leave its way, and a pad that presses on something would be dragged along it.
+        """
+        way = self.velocity_rad_per_s * self._dt_s
+        most = self._kinematics.acceleration_rad_per_s2 * self._dt_s**2
+        share = min(1.0, float(np.min(most / np.maximum(np.abs(way), 1e-12))))
+        wanted = self.last_rad + (1.0 - share) * way
+        self._wanted_rad[:] = wanted
+        return self._step(wanted)
 
     def sent(self, position_rad: Array) -> None:
         """Note the set-point that the arm reports as sent to its drives."""

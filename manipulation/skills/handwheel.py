@@ -22,16 +22,16 @@ from manipulation.skills.outcome import (
     surely_within,
 )
 from manipulation.skills.repeat import perform
-from manipulation.skills.wheel_hold import Belief, Hold, behind_two_spokes, hold_the_rim
+from manipulation.skills.wheel_hold import Belief, Hold, behind_two_spokes, hold_across, hold_the_rim
 from manipulation.skills.wheel_turn import WheelTurn
 
 DRAGGED_RAD = 0.2  # largest turn by which a hand that lets go drags the wheel back
 GAINED_RAD = 0.3  # a wheel that stopped after a turn of so much is turned on
-LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand
 TOLERANCE_RAD = np.radians(6.0)
 AT_STOP_RAD = 0.35
 SAME_RAD = 0.6  # a look that differs by more from where the wheel was left shows that somebody else has turned it
 TURN_RAD = 2.0 * np.pi
+MOST_HOLDS = 30  # of one try
 
 
 def handwheel(
@@ -71,8 +71,7 @@ def handwheel(
 
     def stroke(attempt: Attempt) -> float:
         try:
-            while abs(target_rad - where.known) > 0.3 * TOLERANCE_RAD:
-                _turn_on(attempt, wheel, where, belief, target_rad)
+            _turn_to(attempt, wheel, where, belief, target_rad)
         except SkillFailure as failure:
             failure.reached = where.known  # the whole turns so far must not be lost
             raise
@@ -126,37 +125,61 @@ def believed_angle(wheel: Handwheel, seen: ObjectState) -> float | None:
     return min(possible, key=abs, default=seen.angle_rad)
 
 
+def _turn_to(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Belief, target_rad: float) -> None:
+    """Turn the wheel in as many holds as it takes; what is still missing after `MOST_HOLDS` the read-back shows."""
+    for _ in range(MOST_HOLDS):
+        if abs(target_rad - where.known) <= 0.3 * TOLERANCE_RAD:
+            return
+        _turn_on(attempt, wheel, where, belief, target_rad)
+
+
 def _turn_on(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Belief, target_rad: float) -> None:
     """Turn the wheel in one hold, and look how far it has come unless that was the last one.
 
-    A wheel too heavy for one hold is tried in the other, and one that stops on the way in another hold: friction between
-    fingers and spokes grows while the hand does not turn about the true hub. What a look shows between two holds is one
-    turn at most, so it counts the whole turns whatever the fingers felt.
+    A wheel that a hold does not turn is tried in the next one, and one that stops on the way in another hold: friction
+    between fingers and spokes grows while the hand does not turn about the true hub. What a look shows between two holds
+    is one turn at most, so it counts the whole turns whatever the fingers felt.
 
     Raises:
-        SkillFailure: as `_turn_once`; or the wheel has not followed the hand.
+        SkillFailure: as `_turn_once`; or the wheel has not followed the hand in any hold.
     """
-    begun_rad = where.known
+    begun_rad, hand = where.known, attempt.context.hand
+    belief.learn(begun_rad)
+    hold = belief.next_hold(wheel, hand)
+    if hold is None:
+        raise SkillFailure(
+            Outcome.SLIPPED, f"the wheel followed the hand in no hold, at up to {belief.effort_nm:.1f} N m"
+        )
     try:
-        _turn_once(attempt, wheel, where, belief, target_rad - begun_rad)
+        _turn_once(attempt, wheel, where, belief, hold, target_rad - begun_rad)
+    except Unreachable:
+        belief.failed.add(hold)
+        if belief.next_hold(wheel, hand) is None:
+            raise
+        return
     except SkillFailure as failure:
-        if failure.outcome is Outcome.STIFF and belief.has_another(wheel, attempt.context.hand):
+        if failure.outcome is Outcome.STALLED and where.verify is not None and where.verify() is not None:
+            if abs(target_rad - begun_rad) - abs(target_rad - where.known) < GAINED_RAD:
+                raise
+            belief.failed.clear()
             return
-        if failure.outcome is not Outcome.STALLED or where.verify is None or where.verify() is None:
+        if failure.outcome not in (Outcome.STIFF, Outcome.SLIPPED) or belief.next_hold(wheel, hand) is None:
             raise
-        if abs(target_rad - begun_rad) - abs(target_rad - where.known) < GAINED_RAD:
-            raise
-        belief.failed.clear()
+        if where.verify is not None:
+            where.verify()
         return
     if where.verify is None or abs(target_rad - where.known) <= 0.3 * TOLERANCE_RAD:
         return
     felt_rad = abs(where.known - begun_rad)
-    if where.verify() is not None and abs(where.known - begun_rad) < LEAST_SHARE * felt_rad - 0.3 * TOLERANCE_RAD:
+    missing_rad = belief.learn(where.known) if where.verify() is not None else 0.0
+    if missing_rad and belief.next_hold(wheel, hand) is None:
         turned = f"the wheel turned by {where.known - begun_rad:.2f} rad while the fingers felt {felt_rad:.2f} rad"
         raise SkillFailure(Outcome.SLIPPED, turned)
 
 
-def _turn_once(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Belief, span_rad: float) -> None:
+def _turn_once(
+    attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Belief, hold: Hold, span_rad: float
+) -> None:
     """Turn the wheel in one hold as far as the arm can, and leave.
 
     Raises:
@@ -164,15 +187,15 @@ def _turn_once(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: 
         Unreachable: the arm cannot turn its hand about this hub.
     """
     angle_rad, sign = where.known, float(np.sign(span_rad))
-    holds = spoke_holds(wheel, attempt.context.hand, angle_rad, sign)
-    behind_spokes = belief.prefers_spokes(wheel, holds)
-    hold = Hold.SPOKES if behind_spokes else Hold.RIM
     try:
-        turn, part_rad = (
-            behind_two_spokes(attempt, wheel, holds, span_rad)
-            if behind_spokes
-            else hold_the_rim(attempt, wheel, angle_rad, span_rad, belief.effort_nm)
-        )
+        match hold:
+            case Hold.ACROSS:
+                turn, part_rad = hold_across(attempt, wheel, angle_rad, span_rad, belief)
+            case Hold.SPOKES:
+                holds = spoke_holds(wheel, attempt.context.hand, angle_rad, sign)
+                turn, part_rad = behind_two_spokes(attempt, wheel, holds, span_rad)
+            case Hold.RIM:
+                turn, part_rad = hold_the_rim(attempt, wheel, angle_rad, span_rad, belief.effort_nm)
     except SkillFailure:
         belief.failed.add(hold)
         raise
@@ -180,11 +203,15 @@ def _turn_once(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: 
         turn.turn(part_rad)
         _note(where, turn, sign)
         belief.effort_nm = turn.felt_nm
+        belief.turned(hold, angle_rad, where.known)
     except SkillFailure as failure:
         _note(where, turn, sign)
         where.moved_to(at_a_stop(wheel, where.known, sign, failure.outcome))
-        belief.failed.add(hold)
         belief.effort_nm = max(belief.effort_nm, turn.felt_nm)
+        if failure.outcome is Outcome.SLIPPED:
+            belief.slipped(hold)
+        else:
+            belief.failed.add(hold)
         raise
     finally:
         turn.let_go()

@@ -66,9 +66,8 @@ def felt_in(before: Felt, turned_rad: Array, torque_nm: Array) -> Felt:
     end_nm = float(np.median(torque[-5:]))
     if gives is None:
         return Felt(turned_rad=turned, torque_nm=torque, has_slipped=end_nm < SLIP_RATIO * level.max() - LEAST_NM)
-    slope = float(slopes[:gives].max())
     running = float(np.median(level[gives:][-30:]))
-    moved = ahead[-1] - grid[gives] - (end_nm - level[gives]) / slope
+    moved = ahead[-1] - _wound_up(grid, level, gives, end_nm, float(slopes[:gives].max()))
     return Felt(
         turned_rad=turned,
         torque_nm=torque,
@@ -77,6 +76,20 @@ def felt_in(before: Felt, turned_rad: Array, torque_nm: Array) -> Felt:
         moved_rad=max(0.0, float(moved)),
         has_slipped=end_nm < SLIP_RATIO * level.max() - LEAST_NM,
     )
+
+
+def _wound_up(grid: Array, level_nm: Array, gives: int, end_nm: float, slope: float) -> float:
+    """Return the turn of the hand at which it had loaded the object with `end_nm`, before that gave way.
+
+    The hand is ahead of the object by what pads, fingers and arm yield under the present torque. They have yielded as much
+    under the same torque while the object still stood, which needs no assumption about how they yield.
+    """
+    loaded = np.maximum.accumulate(level_nm[: gives + 1])
+    if end_nm >= loaded[-1]:
+        return float(grid[gives] + (end_nm - loaded[-1]) / slope)
+    k = max(1, int(np.argmax(loaded > end_nm)))
+    share = (end_nm - loaded[k - 1]) / max(loaded[k] - loaded[k - 1], 1e-9)
+    return float(grid[k - 1] + np.clip(share, 0.0, 1.0) * (grid[k] - grid[k - 1]))
 
 
 def _breakaway(level_nm: Array, slopes: Array) -> int | None:

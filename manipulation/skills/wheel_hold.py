@@ -1,4 +1,4 @@
-"""The two ways to hold a handwheel: two fingers behind two spokes, or the rim between the fingers beside a spoke."""
+"""The three ways to hold a handwheel: across the whole wheel, behind two spokes, or by the rim beside a spoke."""
 
 from __future__ import annotations
 
@@ -31,15 +31,23 @@ HOLDS_RAD = (
 )  # largest turns of one hold that are tried, in this order; the arm's wrist allows one of them
 RIM_HOLDS_RAD = (1.7, 0.9)
 INF = float("inf")
-PUSH_N = 51.0  # of one finger on a spoke; the soft pads of the bench slip past it at 58 N
+PUSH_N = 75.0  # of one finger on a spoke
 SIDE_N = 54.0  # of the hand on the rim; where the pads slip, the finger beside a spoke takes all of it, and is pressed past it
 RIM_SIDE_M = 0.009  # largest free space between each finger and the rim when approaching
 SPARE_M = 0.001
+ACROSS_SIDE_M, LEAST_ACROSS_M = 0.006, 0.002  # wanted and least free space on each side of a hand across the wheel
+ACROSS_RAD = tuple(float(a) for a in np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False))  # angles at which it may begin
+ACROSS_LAG_RAD = 0.3
+POOR_FRICTION = 0.3  # of pads on paint, with which the first grip across a wheel reckons
+SPARE_GRIP = 1.3
+GRIP_ACROSS_N = (20.0, 90.0)  # the force of one pad is taken by the other, so neither arm nor shaft feel it
+SLACK_RAD = 0.03
+LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand
 SPOKE_GAP_M = 0.0025  # between the inner finger and the spoke beside which it holds the rim
 FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
 GRIP_N = (12.0, 25.0)  # smallest and largest force of the pads; with 45 N friction along the fingers reached 70 N
 LIGHT_N, SETTLE_S, SETTLES = 8.0, 0.4, 6
-GRIP_STEP_N = 10.0
+GRIP_STEP_N = 20.0
 EVEN_N = 3.0  # a larger side force shows that only one of the pads is at the rim
 # Pads that press lightly centre the hand on the rim before they press firmly: both pads move by one screw, so a rim that is
 # off their middle by 2 mm would push the arm aside with all of the grip force. Along the fingers the friction of the pads
@@ -54,34 +62,109 @@ SIDEWAYS = Compliance(
 class Hold(StrEnum):
     """How a hand holds a wheel."""
 
+    ACROSS = "across"
     SPOKES = "spokes"
     RIM = "rim"
 
 
 @dataclass(slots=True, kw_only=True)
 class Belief:
-    """What is believed of the wheel's effort: the panel file's, then the felt one; and which holds have failed."""
+    """What is believed of a wheel: its effort, by the panel file until it is felt, and which holds have failed.
+
+    Attributes:
+        effort_nm: torque that moves the wheel, or the largest that did not.
+        failed: holds that were tried in vain.
+        grip_n: force of the pads across the wheel; None until the first such hold.
+    """
 
     effort_nm: float
     failed: set[Hold] = field(default_factory=set)
+    grip_n: float | None = None
+    _last: tuple[Hold, float, float] | None = None
 
-    def prefers_spokes(self, wheel: Handwheel, holds: tuple[SpokeHold, ...]) -> bool:
-        """Return whether two spokes are the better hold; of a small wheel they are near the hub, and the rim takes more."""
-        if not holds:
-            return False
-        if self.failed == {Hold.RIM}:
-            return True
-        rim_nm = SIDE_N * wheel.radius_m
-        if self.failed == {Hold.SPOKES}:
-            return self.effort_nm >= rim_nm
-        most_nm = 2.0 * PUSH_N * holds[0].arm_m
-        return self.effort_nm < most_nm or most_nm > rim_nm
+    def next_hold(self, wheel: Handwheel, hand: Hand) -> Hold | None:
+        """Return the hold to try: of those that have not failed, the first that takes the effort, or takes most of it."""
+        takes = {hold: nm for hold, nm in torques_nm(wheel, hand).items() if hold not in self.failed}
+        enough = [hold for hold, nm in takes.items() if nm > self.effort_nm]
+        return enough[0] if enough else max(takes, key=lambda hold: takes[hold], default=None)
 
-    def has_another(self, wheel: Handwheel, hand: Hand) -> bool:
-        """Return whether a hold is left that has not failed, and that takes more than was felt."""
-        if self.failed == {Hold.SPOKES}:
-            return self.effort_nm < SIDE_N * wheel.radius_m
-        return self.failed == {Hold.RIM} and bool(spoke_holds(wheel, hand, 0.0, 1.0))
+    def grip_across_n(self, wheel: Handwheel) -> float:
+        """Return the force of the pads across the wheel: for the believed effort at first, and the largest after a slip."""
+        if self.grip_n is None:
+            self.grip_n = float(
+                np.clip(SPARE_GRIP * self.effort_nm / (2.0 * POOR_FRICTION * _outer_m(wheel)), *GRIP_ACROSS_N)
+            )
+        return self.grip_n
+
+    def turned(self, hold: Hold, begun_rad: float, expected_rad: float) -> None:
+        """Note that a hold has turned the wheel, by what the fingers felt."""
+        self._last = (hold, begun_rad, expected_rad)
+
+    def learn(self, seen_rad: float) -> float:
+        """Compare what the last hold felt with what is seen; returns the turn that is missing, 0 if it is small.
+
+        A hold that slipped has failed; across the wheel only with the largest force of the pads.
+        """
+        if self._last is None:
+            return 0.0
+        (hold, begun_rad, expected_rad), self._last = self._last, None
+        felt_rad, moved_rad = abs(expected_rad - begun_rad), abs(seen_rad - begun_rad)
+        if moved_rad >= LEAST_SHARE * felt_rad - SLACK_RAD:
+            return 0.0
+        self.slipped(hold)
+        return felt_rad - moved_rad
+
+    def slipped(self, hold: Hold) -> None:
+        """Note that the pads slipped."""
+        if hold is Hold.ACROSS and (self.grip_n or 0.0) < 0.9 * GRIP_ACROSS_N[1]:
+            self.grip_n = GRIP_ACROSS_N[1]
+        else:
+            self.failed.add(hold)
+
+
+def torques_nm(wheel: Handwheel, hand: Hand) -> dict[Hold, float]:
+    """Return the torque that each possible hold of a wheel takes, the best hold first."""
+    takes: dict[Hold, float] = {}
+    if across_gap_m(wheel, hand) >= LEAST_ACROSS_M:
+        takes[Hold.ACROSS] = 2.0 * FRICTION * GRIP_ACROSS_N[1] * _outer_m(wheel)
+    if holds := spoke_holds(wheel, hand, 0.0, 1.0):
+        takes[Hold.SPOKES] = 2.0 * PUSH_N * holds[0].arm_m
+    takes[Hold.RIM] = SIDE_N * wheel.radius_m
+    return takes
+
+
+def across_gap_m(wheel: Handwheel, hand: Hand) -> float:
+    """Return the free space between each finger and the rim of a hand that is open across the wheel; may be negative."""
+    return min(ACROSS_SIDE_M, 0.5 * (hand.max_width_m - SPARE_M) - _outer_m(wheel))
+
+
+def _outer_m(wheel: Handwheel) -> float:
+    return wheel.radius_m + wheel.rim_m
+
+
+def hold_across(
+    attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float, belief: Belief
+) -> tuple[WheelTurn, float]:
+    """Hold the whole wheel between the fingers, which nothing but their friction turns; any angle of the hand will do."""
+    hand, sign = attempt.context.hand, float(np.sign(span_rad))
+    low, top = wheel.height_m - wheel.rim_m - RIM_DEPTH_M, wheel.height_m + STANDOFF_M
+
+    def at(angle: float, z: float) -> RigidTransform:
+        return panel_from_grip((*wheel.position_m, z), -angle)
+
+    def ways(part: float) -> list[list[RigidTransform]]:
+        steps = _steps(sign * (part + ACROSS_LAG_RAD))
+        return [[at(angle_rad + start, top), *(at(angle_rad + start + a, low) for a in steps)] for start in ACROSS_RAD]
+
+    width = 2.0 * (_outer_m(wheel) + across_gap_m(wheel, hand))
+    _, part = _begin(attempt, wheel, span_rad, HOLDS_RAD, width, ways)
+    come_down(attempt, STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, what="the wheel")
+    _squeeze(attempt, belief.grip_across_n(wheel), least_m=1.6 * wheel.radius_m, what="wheel")
+    turn = WheelTurn(
+        attempt=attempt, wheel=wheel, sign=sign, behind_rad=0.0, most_nm=2.0 * PUSH_N * _outer_m(wheel),
+        up_m=STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, open_m=width, is_across=True,
+    )  # fmt: skip
+    return turn, part
 
 
 def behind_two_spokes(
@@ -140,7 +223,7 @@ def hold_the_rim(
     come_down(attempt, STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, what="the wheel")
     centre_between(attempt, room_m=2.0 * side, what="rim")
     grip_n = float(np.clip(effort_nm / (2.0 * FRICTION * wheel.radius_m), *GRIP_N))
-    _squeeze(attempt, wheel, grip_n)
+    _squeeze(attempt, grip_n, least_m=0.4 * wheel.rim_m, what="rim")
     turn = WheelTurn(
         attempt=attempt, wheel=wheel, sign=sign, behind_rad=0.0, most_nm=SIDE_N * wheel.radius_m,
         up_m=STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, open_m=width,
@@ -149,24 +232,24 @@ def hold_the_rim(
     return turn, part
 
 
-def _squeeze(attempt: Attempt, wheel: Handwheel, grip_n: float) -> None:
-    """Close lightly and let the hand yield sideways until both pads are at the rim, then firmly in steps.
+def _squeeze(attempt: Attempt, grip_n: float, *, least_m: float, what: str) -> None:
+    """Close lightly and let the hand yield sideways until both pads are at the wheel, then firmly in steps.
 
-    Soft pads go on closing under a firm grip, so the light one tells whether there is a rim between them.
+    Soft pads go on closing under a firm grip, so the light one tells whether there is something between them.
 
     Raises:
-        SkillFailure: there is no rim between the fingers.
+        SkillFailure: the fingers closed to less than `least_m`.
     """
     for _ in range(SETTLES):
-        left_m = attempt.grasp(LIGHT_N, name="touch the rim")
+        left_m = attempt.grasp(LIGHT_N, name=f"touch the {what}")
         if abs(attempt.reports[-1].wrench[0]) < EVEN_N:
             break
         _settle(attempt)
-    if left_m < 0.4 * wheel.rim_m:
-        raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * left_m:.1f} mm; no rim between them")
+    if left_m < least_m:
+        raise SkillFailure(Outcome.MISSED, f"the fingers closed to {1e3 * left_m:.1f} mm; no {what} between them")
     for force_n in np.linspace(LIGHT_N, grip_n, 1 + int(np.ceil((grip_n - LIGHT_N) / GRIP_STEP_N)))[1:]:
         _settle(attempt)
-        attempt.grasp(float(force_n), name="hold the rim")
+        attempt.grasp(float(force_n), name=f"hold the {what}")
     _settle(attempt)
 
 

@@ -49,6 +49,7 @@ class WheelTurn:
         up_m: how far the hand moves back to leave.
         open_m: opening that releases the rim; None when nothing is held between the fingers.
         speed_m_per_s: of the turn, where a turn of 1 rad counts as 0.1 m.
+        is_across: whether the whole wheel is between the fingers, so that its hub is midway between them.
         side_per_nm: force along the line of the fingers for each N m, with which spokes that are not opposite push.
         moved_rad: how far the wheel has turned, not negative.
     """
@@ -62,6 +63,7 @@ class WheelTurn:
     open_m: float | None = None
     speed_m_per_s: float = TURN_M_PER_S
     side_per_nm: float = 0.0
+    is_across: bool = False
     moved_rad: float = 0.0
     _felt: Felt = field(default_factory=Felt)
     _side_n: float = 0.0
@@ -70,7 +72,7 @@ class WheelTurn:
     def __post_init__(self) -> None:
         grip = self.attempt.pose()
         hub = grip.inv().apply(self.attempt.context.panel_pose.apply([*self.wheel.position_m, 0.0]))
-        self._grip_from_hub = RigidTransform.from_translation([hub[0], hub[1], 0.0])
+        self._grip_from_hub = RigidTransform.from_translation([0.0 if self.is_across else hub[0], hub[1], 0.0])
 
     @property
     def felt_nm(self) -> float:
@@ -146,7 +148,7 @@ class WheelTurn:
         """
         along = 400.0
         stiffness = (200.0, 200.0, along)
-        if self.open_m is not None:
+        if self.open_m is not None and not self.is_across:
             stiffness = (50.0, INF, along)
         elif self.side_per_nm > SLIGHT_PER_NM and not self._felt.is_moving:
             stiffness = (INF, 200.0, along)
@@ -163,7 +165,7 @@ class WheelTurn:
         most_n = LARGEST_SIDE_N if self.open_m is None else LARGEST_HELD_N
         side = Guard(name="side force", quantity=Quantity.FORCE, limit=most_n, ticks=SIDE_TICKS)
         effort = Guard(name="effort", quantity=Quantity.TORQUE, limit=self.most_nm, axis=against)
-        if self.open_m is not None or not self._felt.is_moving:
+        if (self.open_m is not None and not self.is_across) or not self._felt.is_moving:
             return effort, side
         limit = min(self.most_nm, STOP_RATIO * self._felt.running_nm + STOP_NM)
         slip_nm = SLIP_RATIO * self._felt.running_nm

@@ -1,4 +1,4 @@
-"""Tests of the choice between the two holds of a handwheel, and of the whole turns that a look between two holds counts."""
+"""Tests of the choice between the holds of a handwheel, and of what is learnt when one of them slips."""
 
 from __future__ import annotations
 
@@ -6,35 +6,56 @@ import pytest
 
 from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
-from manipulation.skills.crank import spoke_holds
-from manipulation.skills.wheel_hold import PUSH_N, SIDE_N, Belief, Hold
+from manipulation.skills.wheel_hold import GRIP_ACROSS_N, Belief, Hold, across_gap_m, torques_nm
 
 HAND = Hand()
-WHEEL = Handwheel(name="w", position_m=(0.0, 0.0), radius_m=0.030, spokes=3)
-HOLDS = spoke_holds(WHEEL, HAND, 0.3, 1.0)
-MOST_NM = 2.0 * PUSH_N * HOLDS[0].arm_m
+SMALL = Handwheel(name="w", position_m=(0.0, 0.0), radius_m=0.030, spokes=3)
+LARGE = SMALL.model_copy(update={"radius_m": 0.045})
 
 
-def test_a_small_wheel_too_heavy_for_two_fingers_on_spokes_is_held_at_its_rim() -> None:
-    assert Belief(effort_nm=0.9 * MOST_NM).prefers_spokes(WHEEL, HOLDS)
-    assert not Belief(effort_nm=1.1 * MOST_NM).prefers_spokes(WHEEL, HOLDS)
-    large = WHEEL.model_copy(update={"radius_m": 0.045})
-    assert Belief(effort_nm=3.0).prefers_spokes(large, spoke_holds(large, HAND, 0.3, 1.0))
+def test_a_small_wheel_is_held_across_and_one_wider_than_the_hand_behind_its_spokes() -> None:
+    assert Belief(effort_nm=0.8).next_hold(SMALL, HAND) is Hold.ACROSS
+    assert across_gap_m(LARGE, HAND) < 0.0
+    assert Belief(effort_nm=0.8).next_hold(LARGE, HAND) is Hold.SPOKES
 
 
-@pytest.mark.parametrize("effort_nm", [0.3, 3.0])
-def test_a_hold_that_has_failed_gives_way_to_the_other(effort_nm: float) -> None:
-    belief = Belief(effort_nm=effort_nm, failed={Hold.SPOKES})
-    rim_is_enough = effort_nm < SIDE_N * WHEEL.radius_m
-    assert belief.prefers_spokes(WHEEL, HOLDS) != rim_is_enough
-    assert belief.has_another(WHEEL, HAND) == rim_is_enough
-    belief = Belief(effort_nm=effort_nm, failed={Hold.RIM})
-    assert belief.prefers_spokes(WHEEL, HOLDS)
-    belief.failed.add(Hold.SPOKES)
-    assert not belief.has_another(WHEEL, HAND)
+def test_the_hold_that_takes_most_is_tried_where_none_takes_the_effort() -> None:
+    takes = torques_nm(SMALL, HAND)
+    assert Belief(effort_nm=10.0).next_hold(SMALL, HAND) is max(takes, key=lambda hold: takes[hold])
 
 
-def test_fingers_that_do_not_fit_between_the_spokes_hold_the_rim_and_have_no_other_hold() -> None:
-    small = WHEEL.model_copy(update={"radius_m": 0.024})
-    assert not Belief(effort_nm=0.3, failed={Hold.RIM}).prefers_spokes(small, spoke_holds(small, HAND, 0.0, 1.0))
-    assert not Belief(effort_nm=0.3, failed={Hold.RIM}).has_another(small, HAND)
+def test_every_hold_is_tried_once_and_then_none_is_left() -> None:
+    belief, tried = Belief(effort_nm=1.0), []
+    while (hold := belief.next_hold(SMALL, HAND)) is not None:
+        tried.append(hold)
+        belief.failed.add(hold)
+    assert sorted(tried) == sorted(torques_nm(SMALL, HAND))
+
+
+def test_fingers_that_do_not_fit_between_the_spokes_do_not_try_them() -> None:
+    assert Hold.SPOKES not in torques_nm(SMALL.model_copy(update={"radius_m": 0.024}), HAND)
+
+
+def test_a_wheel_that_did_not_follow_is_held_with_all_force_before_another_hold_is_tried() -> None:
+    belief = Belief(effort_nm=0.5)
+    first_n = belief.grip_across_n(SMALL)
+    assert first_n < GRIP_ACROSS_N[1]
+    belief.turned(Hold.ACROSS, 0.0, 1.5)
+    assert belief.learn(0.2) == pytest.approx(1.3)
+    assert belief.grip_across_n(SMALL) == GRIP_ACROSS_N[1]
+    assert belief.next_hold(SMALL, HAND) is Hold.ACROSS
+    belief.turned(Hold.ACROSS, 0.2, 1.5)
+    assert belief.learn(0.2) > 1.0
+    assert belief.failed == {Hold.ACROSS}
+
+
+@pytest.mark.parametrize("seen_rad", [1.5, 1.2, 0.8])
+def test_a_wheel_that_followed_at_least_half_way_has_not_slipped(seen_rad: float) -> None:
+    belief = Belief(effort_nm=0.5)
+    belief.turned(Hold.SPOKES, 0.0, 1.5)
+    assert belief.learn(seen_rad) == 0.0
+    assert not belief.failed
+
+
+def test_what_was_not_turned_teaches_nothing() -> None:
+    assert Belief(effort_nm=0.5).learn(3.0) == 0.0

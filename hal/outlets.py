@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from hal.strict import Strict
 
@@ -43,12 +43,46 @@ class PrometheusSection(Strict):
     host: Host = "127.0.0.1"
 
 
+class OpcuaSection(Strict):
+    """`[outlets.opcua]`: a server with an object for each object of the panel, and its alarms as conditions."""
+
+    port: Port = 4840
+    host: Host = "127.0.0.1"
+    username: Annotated[str | None, Field(min_length=1, description="with it, clients must log in")] = None
+    password_file: Annotated[str | None, Field(description="file with the password, which only its owner may read")] = (
+        None
+    )
+    certificate_file: Annotated[
+        str | None, Field(description="PEM; with it, only signed and encrypted connections are taken")
+    ] = None
+    private_key_file: Annotated[str | None, Field(description="PEM, which only its owner may read")] = None
+    acknowledge: Annotated[bool, Field(description="clients may acknowledge alarms; nothing else can be called")] = (
+        False
+    )
+    key_file: Annotated[
+        str | None, Field(description="file with an operator's key, by which alarms are acknowledged")
+    ] = None
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> OpcuaSection:
+        if (self.username is None) != (self.password_file is None):
+            raise ValueError("username and password_file go together: give both or none")
+        if (self.certificate_file is None) != (self.private_key_file is None):
+            raise ValueError("certificate_file and private_key_file go together: give both or none")
+        if self.acknowledge and self.username is None:
+            raise ValueError("acknowledge needs username and password_file: else anybody could acknowledge alarms")
+        if self.key_file is not None and not self.acknowledge:
+            raise ValueError("key_file is of use only with acknowledge = true")
+        return self
+
+
 class OutletsSection(Strict):
     """`[outlets]`: what the gateway tells; without any of these there is no gateway."""
 
     mqtt: MqttSection | None = None
     webhook: WebhookSection | None = None
     prometheus: PrometheusSection | None = None
+    opcua: OpcuaSection | None = None
 
     @property
     def is_empty(self) -> bool:

@@ -20,10 +20,10 @@ from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.gc_freeze import freeze_loaded
 from service.client import Client
+from service.commissioning.outlets import checked_outlets
 from service.core import Service, book_of
 from service.exposure import Exposure, unix_socket
 from service.operations import Operation
-from service.outlets.check import checked_outlets
 from service.processes.client_host import GATEWAY, OUTLETS, OUTLETS_KEY, ClientHost, ConsoleHost
 from service.processes.stop_host import bound_socket
 
@@ -259,7 +259,7 @@ class Panelwright:
         """Return the process of the outlets; None if the cell file asks for none."""
         if cell.file.outlets.is_empty:
             return None
-        outlets = checked_outlets(cell.file.outlets, cell.path.parent)
+        outlets = checked_outlets(cell.file.outlets, cell.path.parent, source=str(cell.path))
         cert = self._exposure.tls_cert
         arguments = ["--service", self.url, "--cell", cell.name]
         arguments += ["--folder", str((options.runs_dir / ".service" / "outlets").absolute())]

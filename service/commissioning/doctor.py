@@ -19,6 +19,7 @@ from hal.errors import REINSTALL, CellError, ConfigError, detail_lines
 from hal.registry import installed_drivers
 from service.client import ApiError, Client
 from service.commissioning.cell_check import objects_in_reach
+from service.commissioning.outlets import checked_outlets
 from service.commissioning.preflight import check_machine, check_python, check_simulator
 from service.commissioning.to_measure import to_measure
 from service.knowledge.calibrations import Calibrations
@@ -47,6 +48,7 @@ def examine(cell: Path, port: int, *, connect: bool) -> bool:
         ("drivers", lambda: ", ".join(installed_drivers())),
         (f"port {port}", lambda: _ports(port, served)),
         ("cell file", lambda: _cell_file(cell)),
+        ("outlets", lambda: _outlets(cell)),
         ("runs folder", _writable),
         ("timer", _timer),
     ]
@@ -144,6 +146,13 @@ def _cell_file(path: Path) -> str:
     objects, reached = len(cell.panel.objects), objects_in_reach(cell)
     reach = "" if reached is None else f", {sum(reached.values())} in reach"
     return f"{cell.name}: {len(cell.file.devices)} devices, panel {cell.panel.name} ({objects} objects{reach})"
+
+
+def _outlets(path: Path) -> str:
+    cell = load_cell(find_cell(path))
+    asked = [name for name, section in cell.file.outlets if section is not None]
+    checked_outlets(cell.file.outlets, cell.path.parent, source=str(cell.path))
+    return ", ".join(asked) or "none"
 
 
 def _writable() -> str:

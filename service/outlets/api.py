@@ -6,12 +6,13 @@ import json
 import ssl
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import httpx2
 
 from hal.errors import DeviceUnavailable
 from service.client import ApiError
-from service.outlets.source import CellState, Changes, Cursor
+from service.outlets.source import CellState, Changes, Cursor, Instrument, instruments_of
 
 TIMEOUT_S = 10.0
 
@@ -22,6 +23,7 @@ class ApiSource:
     Args:
         url: its address.
         key: an observer's key, for a service that has keys.
+        key_to_acknowledge: an operator's key, for a service that has keys.
         ca: certificate to trust, for an https address.
         transport: carries the requests; None for the network.
     """
@@ -31,10 +33,12 @@ class ApiSource:
         url: str,
         *,
         key: str | None = None,
+        key_to_acknowledge: str | None = None,
         ca: Path | None = None,
         transport: httpx2.AsyncBaseTransport | None = None,
     ) -> None:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        self._may_acknowledge = {} if key_to_acknowledge is None else {"Authorization": f"Bearer {key_to_acknowledge}"}
         verify: ssl.SSLContext | bool = True if ca is None else ssl.create_default_context(cafile=ca)
         self._http = httpx2.AsyncClient(
             base_url=url, headers=headers, timeout=TIMEOUT_S, trust_env=False, verify=verify, transport=transport
@@ -61,6 +65,21 @@ class ApiSource:
             devices={one["name"]: one for one in devices["devices"]},
             is_ready=bool(ready.get("is_ready", False)),
         )
+
+    async def panel(self) -> tuple[Instrument, ...]:
+        """Return the objects of the panel."""
+        return instruments_of(await self._get("/v1/panel"))
+
+    async def acknowledge(self, alarm: str, *, by: str, reason: str) -> None:
+        """Acknowledge an alarm."""
+        path = f"/v1/alarms/{quote(alarm, safe='')}/acknowledge"
+        try:
+            answer = await self._http.post(path, json={"by": by, "reason": reason}, headers=self._may_acknowledge)
+            found = json.loads(answer.content)
+        except (httpx2.RequestError, ValueError) as error:
+            raise DeviceUnavailable(f"the service does not answer: {error}", hint="see its log") from error
+        if answer.status_code >= httpx2.codes.BAD_REQUEST:
+            raise ApiError(found if isinstance(found, dict) else {})
 
     async def close(self) -> None:
         """Close its connections."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Protocol
 
 from hal.errors import CellError
-from service.outlets.source import Changes, CursorFile, Source
+from service.outlets.source import Changes, Kept, Source
 
 WAIT_S = 20.0
 PAUSES_S = (1.0, 2.0, 5.0, 10.0, 30.0)
@@ -37,7 +39,7 @@ class Backoff:
 
 
 async def batches(
-    source: Source, kept: CursorFile, *, on_silence: Callable[[bool], Awaitable[None]], sleep: Sleep = asyncio.sleep
+    source: Source, kept: Kept, *, on_silence: Callable[[bool], Awaitable[None]], sleep: Sleep = asyncio.sleep
 ) -> AsyncIterator[Changes]:
     """Yield changes for ever; the cursor is saved when the next batch is asked for, so after a batch was delivered.
 
@@ -50,7 +52,7 @@ async def batches(
     cursor = kept.load()
     while True:
         try:
-            found = await source.changes(cursor, wait_s=WAIT_S)
+            found = await source.changes(cursor, wait_s=0.0 if is_silent else WAIT_S)  # an answer ends the silence
         except CellError as error:
             if not is_silent:
                 log.warning("%s", error.what)
@@ -66,3 +68,22 @@ async def batches(
         if found.cursor != cursor:
             cursor = found.cursor
             kept.save(cursor)
+
+
+class Login(Protocol):
+    """A section with a user."""
+
+    @property
+    def password_file(self) -> str | None:
+        """File with the user's password."""
+        ...
+
+
+def password_of(section: Login) -> str | None:
+    """Return the password in the section's file; None without one."""
+    return secret_in(section.password_file)
+
+
+def secret_in(file: str | None) -> str | None:
+    """Return the text of a file without the space around it; None without a file."""
+    return None if file is None else Path(file).read_text(encoding="utf-8").strip()

@@ -11,7 +11,6 @@ import asyncio
 import json
 import logging
 import ssl
-from pathlib import Path
 from typing import Any
 
 import aiomqtt
@@ -99,10 +98,3 @@ class MqttOutlet:
 
 def _status(state: str) -> str:
     return json.dumps({"state": state})
-
-
-def password_of(section: MqttSection) -> str | None:
-    """Return the password in the section's file; None without one."""
-    if section.password_file is None:
-        return None
-    return Path(section.password_file).read_text(encoding="utf-8").strip()

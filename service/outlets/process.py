@@ -13,6 +13,7 @@ from typing import Any
 
 from hal.outlets import OutletsSection
 from service.outlets.api import ApiSource
+from service.outlets.deliver import password_of, secret_in
 from service.outlets.source import CursorFile, Source
 from service.processes.child import Lifeline
 from service.processes.client_host import OUTLETS, OUTLETS_KEY
@@ -28,7 +29,7 @@ def outlets_of(section: OutletsSection, *, cell: str, source: Source, folder: Pa
     """
     found: list[Run] = []
     if section.mqtt is not None:
-        from service.outlets.mqtt import MqttOutlet, password_of
+        from service.outlets.mqtt import MqttOutlet
 
         found.append(
             MqttOutlet(
@@ -48,7 +49,7 @@ def outlets_of(section: OutletsSection, *, cell: str, source: Source, folder: Pa
                 cell=cell,
                 source=source,
                 cursor=CursorFile(folder / "webhook.json"),
-                secret=Path(section.webhook.secret_file).read_text(encoding="utf-8").strip(),
+                secret=secret_in(section.webhook.secret_file) or "",
                 dead_letters=folder / "dead-letters.jsonl",
             ).run
         )
@@ -56,6 +57,10 @@ def outlets_of(section: OutletsSection, *, cell: str, source: Source, folder: Pa
         from service.outlets.prometheus import PrometheusOutlet
 
         found.append(PrometheusOutlet(section.prometheus, cell=cell, source=source).run)
+    if section.opcua is not None:
+        from service.outlets.opcua import OpcuaOutlet
+
+        found.append(OpcuaOutlet(section.opcua, cell=cell, source=source, password=password_of(section.opcua)).run)
     return found
 
 
@@ -77,7 +82,12 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="gateway: %(message)s")
     logging.getLogger("httpx2").setLevel(logging.WARNING)
     section = OutletsSection.model_validate_json(os.environ.pop(OUTLETS))
-    source = ApiSource(options.service, key=os.environ.pop(OUTLETS_KEY, None), ca=options.ca)
+    source = ApiSource(
+        options.service,
+        key=os.environ.pop(OUTLETS_KEY, None),
+        key_to_acknowledge=secret_in(None if section.opcua is None else section.opcua.key_file),
+        ca=options.ca,
+    )
     lifeline = Lifeline()
 
     def end_with_parent() -> None:

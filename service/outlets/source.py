@@ -38,6 +38,45 @@ class CellState:
     is_ready: bool = False
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instrument:
+    """An object of the panel as the panel file describes it.
+
+    Attributes:
+        name, kind, label: of the panel file; `label` is what stands beside it.
+        unit, low, high: of its scale; an object without one has no range.
+        priority: of its alarms.
+    """
+
+    name: str
+    kind: str
+    label: str = ""
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    priority: str = "medium"
+
+
+def instruments_of(panel: Mapping[str, Any]) -> tuple[Instrument, ...]:
+    """Return the objects of a panel as `GET /v1/panel` shows it."""
+    found = []
+    for one in panel["objects"]:
+        scale = one.get("scale") or one
+        has_scale = isinstance(scale.get("minimum"), float | int) and isinstance(scale.get("maximum"), float | int)
+        found.append(
+            Instrument(
+                name=one["name"],
+                kind=one["kind"],
+                label=str(one.get("label") or ""),
+                unit=str(scale.get("unit") or ""),
+                low=float(scale["minimum"]) if has_scale else None,
+                high=float(scale["maximum"]) if has_scale else None,
+                priority=one.get("priority", "medium"),
+            )
+        )
+    return tuple(found)
+
+
 class Source(Protocol):
     """A cell as outlets see it."""
 
@@ -52,6 +91,45 @@ class Source(Protocol):
     async def state(self) -> CellState:
         """Return the state now; raises as `changes`."""
         ...
+
+    async def panel(self) -> tuple[Instrument, ...]:
+        """Return the objects of the panel; raises as `changes`."""
+        ...
+
+    async def acknowledge(self, alarm: str, *, by: str, reason: str) -> None:
+        """Acknowledge an alarm for somebody.
+
+        Raises:
+            CellError: the service does not answer, or refuses.
+        """
+        ...
+
+
+class Kept(Protocol):
+    """Where a cursor is kept between two batches."""
+
+    def load(self) -> Cursor:
+        """Return the saved cursor; an empty one before the first."""
+        ...
+
+    def save(self, cursor: Cursor) -> None:
+        """Save a cursor, after all before it was delivered."""
+        ...
+
+
+class Memory:
+    """A cursor for an outlet that tells the state anew whenever it begins."""
+
+    def __init__(self) -> None:
+        self._cursor = Cursor()
+
+    def load(self) -> Cursor:
+        """Return the saved cursor."""
+        return self._cursor
+
+    def save(self, cursor: Cursor) -> None:
+        """Save a cursor until this process ends."""
+        self._cursor = cursor
 
 
 class CursorFile:

@@ -6,13 +6,24 @@ import asyncio
 from typing import Any
 
 from hal.errors import DeviceUnavailable
-from service.outlets.source import CellState, Changes, Cursor
+from service.outlets.source import CellState, Changes, Cursor, Instrument, instruments_of
 
 READING: dict[str, Any] = {
     "id": 0, "object": "pressure", "kind": "gauge", "utc_s": 1.79e9, "quality": "valid", "cause": "", "value": 1.0, "unit": "bar",
     "sigma": 0.1, "state": None, "text": None, "confidence": 0.9, "sure": True, "task": "t",
 }  # fmt: skip
-ALARM: dict[str, Any] = {"id": "pressure.high", "number": 0, "state": "unacknowledged", "is_active": True}
+ALARM: dict[str, Any] = {
+    "id": "pressure.high", "object": "pressure", "kind": "high", "number": 0, "state": "unacknowledged", "is_active": True,
+    "says": "pressure is 7 bar, above 6", "changed_s": 1.79e9, "by": "the cell", "reason": "",
+}  # fmt: skip
+PANEL: dict[str, Any] = {
+    "objects": [
+        {"name": "pressure", "kind": "gauge", "label": "P1", "priority": "high",
+         "scale": {"minimum": 0.0, "maximum": 10.0, "unit": "bar"}},
+        {"name": "temperature", "kind": "display", "label": "T1", "unit": "degC", "minimum": 0, "maximum": 199.9},
+        {"name": "pump_lamp", "kind": "lamp", "label": ""},
+    ]
+}  # fmt: skip
 
 
 class FakeSource:
@@ -23,6 +34,7 @@ class FakeSource:
         self.alarms: list[dict[str, Any]] = []
         self.is_silent, self.batch = False, batch
         self.changed = asyncio.Event()
+        self.acknowledged: list[tuple[str, str, str]] = []
 
     def reads(self, value: float | None, **given: Any) -> None:
         """Add a reading; None is a refused one."""
@@ -47,6 +59,8 @@ class FakeSource:
             if readings or alarms:
                 at = Cursor(reading=cursor.reading + len(readings), alarm=cursor.alarm + len(alarms))
                 return Changes(readings=tuple(readings), alarms=tuple(alarms), cursor=at)
+            if not wait_s:
+                return Changes(cursor=cursor)
             await self.changed.wait()
 
     async def state(self) -> CellState:
@@ -57,6 +71,15 @@ class FakeSource:
             alarms={one["id"]: one for one in self.alarms},
             is_ready=True,
         )
+
+    async def panel(self) -> tuple[Instrument, ...]:
+        if self.is_silent:
+            raise DeviceUnavailable("the service does not answer", hint="wait")
+        return instruments_of(PANEL)
+
+    async def acknowledge(self, alarm: str, *, by: str, reason: str) -> None:
+        self.acknowledged.append((alarm, by, reason))
+        self.alarms_change(id=alarm, state="acknowledged", by=by, reason=reason)
 
 
 async def no_pause(_seconds: float) -> None:

@@ -21,7 +21,7 @@ from hal.config import load_cell
 from hal.errors import ConfigError
 from hal.outlets import MqttSection, OutletsSection, PrometheusSection, WebhookSection
 from service.access.keys import Role
-from service.outlets.check import checked_outlets
+from service.commissioning.outlets import checked_outlets
 from service.outlets.process import outlets_of
 from service.outlets.prometheus import PrometheusOutlet
 from service.outlets.source import Cursor, CursorFile
@@ -165,8 +165,22 @@ def test_a_secret_that_is_missing_or_open_to_others_is_refused(
         checked_outlets(section, tmp_path)
 
 
+def test_all_faults_of_the_outlets_are_named_at_once(tmp_path: Path) -> None:
+    (tmp_path / "open").write_text("s3cret")
+    section = OutletsSection(
+        mqtt=MqttSection(host="broker", username="a", password_file="open"),  # noqa: S106 - a path
+        webhook=WebhookSection(url="http://a/b", secret_file="missing"),  # noqa: S106 - a path
+    )
+    with pytest.raises(ConfigError, match=r"outlets\.mqtt\.password_file.*and 1 more fault") as caught:
+        checked_outlets(section, tmp_path, source="cell.toml")
+    assert [str(fault).split(":")[0] for fault in caught.value.details["faults"]] == [
+        "outlets.mqtt.password_file",
+        "outlets.webhook.secret_file",
+    ]
+
+
 def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.outlets.check.find_spec", lambda _name: None)
+    monkeypatch.setattr("service.commissioning.outlets.find_spec", lambda _name: None)
     with pytest.raises(ConfigError, match="aiomqtt") as caught:
         checked_outlets(OutletsSection(mqtt=MqttSection(host="broker")), tmp_path)
     assert "panelwright[mqtt]" in caught.value.hint

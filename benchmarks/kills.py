@@ -90,15 +90,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def killed(role: str, times: int, *, seed: int, cell: Path) -> list[Round]:
     """Kill one role in missions; returns the rounds, and as the last one what the end of the run shows."""
+    with tempfile.TemporaryDirectory(prefix="panelwright-kills-") as folder:
+        return chaos_rounds((f"kill {role}",), times, seed=seed, cell=cell, folder=Path(folder))
+
+
+def chaos_rounds(faults: tuple[str, ...], times: int, *, seed: int, cell: Path, folder: Path) -> list[Round]:
+    """Run chaos with some faults only; returns the rounds, and as the last one what the end of the run shows."""
     kinds = {name: section.kind.value for name, section in load_cell(cell).file.devices.items()}
     arm = next(name for name, kind in kinds.items() if kind == "arm")
-    options = ChaosOptions(seed=seed, rounds=times, faults=(f"kill {role}",))
-    with tempfile.TemporaryDirectory(prefix="panelwright-kills-") as folder:
-        chaos = Chaos(
-            Plant(command=serve_command(cell, None), runs=Path(folder) / "runs"), options, arm=arm, devices=()
-        )
-        rounds = list(chaos.rounds(lambda one: print(f"  {one}", file=sys.stderr, flush=True)))
-        return [*rounds, chaos.final]
+    options = ChaosOptions(seed=seed, rounds=times, faults=faults)
+    plant = Plant(command=serve_command(cell, None), runs=folder / "runs")
+    chaos = Chaos(plant, options, arm=arm, devices=tuple(kinds))
+    rounds = list(chaos.rounds(lambda one: print(f"  {one}", file=sys.stderr, flush=True)))
+    return [*rounds, chaos.final]
 
 
 def _print(role: str, rounds: Sequence[Round]) -> float:

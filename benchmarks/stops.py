@@ -1,8 +1,8 @@
-"""Stops under load: `python -m benchmarks.stops [--times 300] [--cell FILE]`.
+"""Stops under load: `python -m benchmarks.stops [--times 300] [--cell FILE] [--realtime]`.
 
 Starts the service in processes of its own and sends `POST /v1/stop` to the stop port while clients load the main port. Measures
-the time from the request to the set latch, which the control thread reads at its next tick, and how many stops were missed.
-Then 50 listeners take the stream while a mission runs. Prints tables and pass lines.
+the time from the request to the set latch, and to the first set-point with which a control thread brakes a moving (fake) arm at
+250 Hz, and how many stops were missed. Then 50 listeners take the stream while a mission runs. Prints tables and pass lines.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -25,10 +26,12 @@ import httpx2
 import numpy as np
 from websockets.sync.client import connect
 
+from benchmarks.control_probe import REALTIME, ControlProbe, control_probe
 from service.processes.latch import LATCH, Latch
 
 ROOT = Path(__file__).resolve().parents[1]
 PASS_S = 0.010
+CONTROL_HZ = 250.0
 PASS_SHARE, PASS_LAG_S = 0.97, 0.020
 LONGEST_S = 1.0
 LISTENERS, STREAM_S, RATE_HZ = 50, 15.0, 20.0
@@ -37,20 +40,37 @@ import sys
 from pathlib import Path
 from hal.config import load_cell
 from service.serve import Options, Panelwright
-panelwright = Panelwright(load_cell(Path(sys.argv[1])), Options(port=0, runs_dir=Path(sys.argv[2])))
+panelwright = Panelwright(load_cell(Path(sys.argv[1])), Options(port=0, runs_dir=Path(sys.argv[2]), console=True))
 panelwright.start()
-print(panelwright.url, panelwright.stop_port, panelwright.service.supervisor.folder, flush=True)
+print(panelwright.url, panelwright.stop_port, panelwright.console_url, panelwright.service.supervisor.folder, flush=True)
 sys.stdin.read()
 panelwright.close()
+"""
+BROWSERS = """
+import select, sys
+from playwright.sync_api import sync_playwright
+with sync_playwright() as play:
+    browser = play.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox", "--disable-gpu"])
+    pages = [browser.new_context().new_page() for _ in range(10)]
+    for page in pages:
+        page.goto(sys.argv[1], timeout=120000, wait_until="domcontentloaded")
+    print("shown", flush=True)
+    while not select.select([sys.stdin], [], [], 0)[0]:
+        for page in pages:
+            page.reload(timeout=120000, wait_until="domcontentloaded")
+            page.wait_for_timeout(500)
+    browser.close()
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Served:
-    """A running service: its address, its stop port and its latch."""
+    """A running service: its address, its stop port, its console and its latch."""
 
     url: str
     stop_port: int
+    console_url: str
+    folder: Path
     latch: Latch
 
     @property
@@ -69,40 +89,57 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=300)
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
+    parser.add_argument("--realtime", action="store_true", help="real-time priority for the control thread, as by chrt")
+    parser.add_argument("--only", default="", help="only loads whose name contains this")
     given = parser.parse_args(arguments)
     worst_s, missed = 0.0, 0
-    print("| load | stops | missed | ms, median | p99 | longest |")
-    print(f"|{' --- |' * 6}", flush=True)
-    with _served(given.cell) as served:
+    print(
+        "| load | stops | missed | to the latch ms, median | p99 | to braking ms, median | p99 | longest | CPU load |"
+    )
+    print(f"|{' --- |' * 9}", flush=True)
+    prefix = REALTIME if given.realtime else ()
+    with (
+        _served(given.cell) as served,
+        control_probe(served.folder / LATCH, rate_hz=CONTROL_HZ, prefix=prefix) as probe,
+    ):
         for name, load in LOADS.items():
+            if given.only not in name:
+                continue
             with load(served):
-                taken = np.array([_stop(served) for _ in range(given.times)])
-            lost = int(np.isnan(taken).sum())
-            worst_s, missed = max(worst_s, float(np.nanquantile(taken, 0.99))), missed + lost
-            figures = [1e3 * float(x) for x in (np.nanmedian(taken), np.nanquantile(taken, 0.99), np.nanmax(taken))]
-            print(f"| {name} | {len(taken)} | {lost} | " + " | ".join(f"{x:.1f}" for x in figures) + " |", flush=True)
+                taken = np.array([_stop(served, probe) for _ in range(given.times)])
+            lost = int(np.isnan(taken[:, 1]).sum())
+            worst_s, missed = max(worst_s, float(np.nanquantile(taken[:, 1], 0.99))), missed + lost
+            (latch, braking), (latch_99, braking_99) = np.nanmedian(taken, axis=0), np.nanquantile(taken, 0.99, axis=0)
+            figures = [1e3 * float(x) for x in (latch, latch_99, braking, braking_99, np.nanmax(taken[:, 1]))]
+            told = " | ".join(f"{x:.1f}" for x in figures)
+            print(f"| {name} | {len(taken)} | {lost} | {told} | {os.getloadavg()[0]:.0f} |", flush=True)
         share, lag_s = _streams(served)
     print(f"stops: p99 {1e3 * worst_s:.1f} ms in the worst line, {missed} missed (pass: {1e3 * PASS_S:.0f} ms, 0)")
     print(f"{LISTENERS} listeners: lowest share {share:.1%}, lag p99 {1e3 * lag_s:.0f} ms (pass: 97 %, 20 ms)")
     return int(worst_s > PASS_S or missed > 0 or share < PASS_SHARE or lag_s > PASS_LAG_S)
 
 
-def _stop(served: Served) -> float:
-    """Return the seconds from a stop to the set latch, NaN when it was not set; reset it afterwards."""
+def _stop(served: Served, probe: ControlProbe) -> tuple[float, float]:
+    """Return the seconds from a stop to the set latch, and to the first set-point that brakes; NaN when it was missed."""
     with served.client() as client:
         state = client.get("/v1/stop").json()
         if state["is_latched"]:
             client.post("/v1/stop/reset", json={"seen_count": state["count"]}).raise_for_status()
+    probe.begin_motion()
     with socket.create_connection(("127.0.0.1", served.stop_port)) as link:
-        begun_s = time.perf_counter()
+        begun_s = time.monotonic()
         link.sendall(b"POST /v1/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         while not served.latch.is_set():
-            if time.perf_counter() - begun_s > LONGEST_S:
-                return float("nan")
-        taken_s = time.perf_counter() - begun_s
+            if time.monotonic() - begun_s > LONGEST_S:
+                served.latch.set("the benchmark ends the motion")
+                probe.braking_s(begun_s)
+                return float("nan"), float("nan")
+            time.sleep(0.0001)
+        latched_s = time.monotonic()
+        braking_s = probe.braking_s(begun_s)
         while link.recv(4096):  # the answer comes when the stop is recorded
             pass
-    return taken_s
+    return latched_s - begun_s, braking_s - begun_s
 
 
 @contextmanager
@@ -144,6 +181,20 @@ def _silent(served: Served) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def _browsers(served: Served) -> Iterator[None]:
+    """Show the console on ten pages, and let each ask for another page of it now and then."""
+    with tempfile.TemporaryFile("w+") as log:
+        command = [sys.executable, "-c", BROWSERS, served.console_url]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True) as process:
+            assert process.stdin is not None and process.stdout is not None
+            if process.stdout.readline().strip() != "shown":
+                log.seek(0)
+                raise RuntimeError(f"the console is not shown: {log.read()[-500:]}")
+            yield
+            process.stdin.close()
+
+
 BIG = json.dumps({"point_m": [0.0] * 150_000})
 LOADS: dict[str, Callable[[Served], contextlib.AbstractContextManager[None]]] = {
     "idle": _idle,
@@ -155,7 +206,7 @@ LOADS: dict[str, Callable[[Served], contextlib.AbstractContextManager[None]]] = 
     ),
     "full pool": _repeating(lambda client: client.get("/v1/devices/range_scanner/reading?format=npz"), 45),
     "400 silent": _silent,
-    "10 pages": _repeating(lambda client: (client.get("/"), client.get("/readyz"), client.get("/v1/tasks")), 10),
+    "console, 10 browsers": _browsers,
 }
 
 
@@ -189,9 +240,11 @@ def _served(cell: Path) -> Iterator[Served]:
         command = [sys.executable, "-P", "-c", SERVICE, str(cell), runs]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None and process.stdin is not None
-            url, stop_port, folder = process.stdout.readline().split()
+            url, stop_port, console_url, folder = process.stdout.readline().split()
             with Latch(Path(folder) / LATCH) as latch:
-                yield Served(url=url, stop_port=int(stop_port), latch=latch)
+                yield Served(
+                    url=url, stop_port=int(stop_port), console_url=console_url, folder=Path(folder), latch=latch
+                )
             process.stdin.close()
             process.wait(60.0)
 

@@ -19,6 +19,7 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.gc_freeze import freeze_loaded
+from hal.process_state import COMPUTES, set_memory_priority
 from service.client import Client
 from service.commissioning.outlets import checked_outlets
 from service.core import Service, book_of
@@ -188,6 +189,9 @@ class Panelwright:
             CellError: the cell could not start.
         """
         exit_on_sigterm()
+        set_memory_priority(
+            COMPUTES
+        )  # perception may fill the memory; the cell and the stop process must not pay for it
         try:
             self._begin()
             assert self._server is not None  # noqa: S101 - narrowing: `_begin` made it

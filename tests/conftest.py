@@ -9,6 +9,7 @@ settings.register_profile("repeatable", derandomize=True, deadline=None, print_b
 settings.register_profile(
     "long", deadline=None, print_blob=True
 )  # for the figures; see tests/service/http/test_life_cycle.py
+settings.register_profile("seeded", deadline=None, print_blob=True, max_examples=50)  # for benchmarks.faults
 settings.load_profile("repeatable")
 
 

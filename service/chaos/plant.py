@@ -43,6 +43,7 @@ class Plant:
         life: number of the present life, from 1.
         lines: what it printed.
         seen: all its processes that are known.
+        key: the key with which it is asked, where it has keys.
         orphans: processes that were found to outlive it; `sweep` kills them too.
     """
 
@@ -53,6 +54,7 @@ class Plant:
     port: int = 0
     stop_port: int = 0
     seen: dict[int, Process] = field(default_factory=dict)
+    key: str | None = None
     orphans: list[Process] = field(default_factory=list)
     _process: subprocess.Popen[str] | None = None
 
@@ -63,7 +65,7 @@ class Plant:
 
     def client(self, timeout_s: float = 10.0) -> Client:
         """Return a client of the main port."""
-        return Client(url=f"http://127.0.0.1:{self.port}", timeout_s=timeout_s)
+        return Client(url=f"http://127.0.0.1:{self.port}", timeout_s=timeout_s, key=self.key)
 
     def stop_client(self, timeout_s: float = 2.0) -> Client:
         """Return a client of the stop port."""

@@ -20,6 +20,7 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceError
 from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
+from hal.process_state import MOVES, set_memory_priority
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
 from hal.simulated import Fault
@@ -260,6 +261,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     sys.setswitchinterval(SWITCH_S)
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
+    set_memory_priority(MOVES)  # as its parent had it before it began to compute
     import hal.jit  # noqa: F401 - the simulated world needs it too, and takes it from here
 
     keep_spare()  # before any thread begins

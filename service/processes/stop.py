@@ -20,6 +20,7 @@ import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from hal.process_state import MOVES, set_memory_priority
 from service.processes.beat import PERIOD_S, SILENCE_S, Beat
 from service.processes.latch import LATCH, Latch, LatchState
 
@@ -232,6 +233,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     with contextlib.suppress(OSError):
         os.nice(-10)  # only root may raise the priority; the process works without it
+    set_memory_priority(MOVES)
     with Latch(options.folder / LATCH) as latch, socket.socket(fileno=options.fd) as listener:
         watchdog = Watchdog(latch, options.folder, silence_s=options.silence)
         asyncio.run(_run(listener, latch, tuple(options.origin), watchdog))

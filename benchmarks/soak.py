@@ -1,0 +1,128 @@
+"""Memory and descriptors of a service under a mix for long: `python -m benchmarks.soak [--minutes 30] [--settle 5]`.
+
+Missions, readings, pictures, listeners of the stream that come and go, stops with resets, and broken requests. Memory (proportional
+set size) and open descriptors of every process are sampled; after the first minutes, in which libraries and kernels load, the
+memory may grow by 5 MB and the descriptors not at all. Prints a table and the pass line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import psutil
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import connect
+
+from hal.errors import CellError
+from service.chaos.plant import Plant, serve_command
+from service.client import FINAL
+
+ROOT = Path(__file__).resolve().parents[1]
+START_S = 400.0
+EVERY_S = 5.0
+PASS_MB = 5.0
+WINDOW = 0.2  # of the samples: the medians of the first and the last ones are compared
+ROLES = ("service", "cell", "stop", "world")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run and print; return 1 if a pass line is missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--settle", type=float, default=5.0, help="minutes that do not count")
+    given = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        plant = Plant(command=serve_command(ROOT / "cells/bench.toml", None), runs=Path(folder) / "runs")
+        end = threading.Event()
+        try:
+            plant.start()
+            plant.await_ready(START_S)
+            done = [0] * len(MIX)
+            for number in range(len(MIX)):
+                threading.Thread(target=_repeat, args=(number, plant, end, done), daemon=True).start()
+            samples = _sampled(plant, 60.0 * given.minutes, 60.0 * given.settle)
+            tracebacks = sum("Traceback" in line for line in plant.lines)
+        finally:
+            end.set()
+            plant.end()
+            plant.sweep()
+    print(", ".join(f"{count} x {work.__name__[1:]}" for work, count in zip(MIX, done, strict=True)))
+    print(
+        "| process | MB at first | at last | grown | descriptors at first | at last |\n| --- | --- | --- | --- | --- | --- |"
+    )
+    grown_mb, more = 0.0, 0.0
+    for role, rows in samples.items():
+        part = max(1, round(WINDOW * len(rows)))
+        first, last = np.median(rows[:part], axis=0), np.median(rows[-part:], axis=0)
+        grown_mb, more = grown_mb + max(0.0, last[0] - first[0]), more + max(0.0, last[1] - first[1])
+        print(
+            f"| {role} | {first[0]:.1f} | {last[0]:.1f} | {last[0] - first[0]:+.1f} | {first[1]:.0f} | {last[1]:.0f} |"
+        )
+    print(
+        f"memory {grown_mb:+.1f} MB after {given.settle:.0f} of {given.minutes:.0f} minutes (pass: +{PASS_MB:.0f}), descriptors "
+        f"{more:+.0f} (pass: 0), tracebacks {tracebacks} (pass: 0), load {os.getloadavg()[0]:.0f}"
+    )
+    return int(grown_mb > PASS_MB or more > 0 or tracebacks > 0)
+
+
+def _sampled(plant: Plant, seconds: float, settle_s: float) -> dict[str, list[tuple[float, float]]]:
+    """Return memory in MB and descriptors of each role, sampled after the time to settle."""
+    begun_s = time.monotonic()
+    rows: dict[str, list[tuple[float, float]]] = {role: [] for role in ROLES}
+    while (passed_s := time.monotonic() - begun_s) < seconds:
+        time.sleep(EVERY_S)
+        for role, process in plant.roles().items() if passed_s >= settle_s else ():
+            with suppress(psutil.Error):
+                one = psutil.Process(process.pid)
+                rows[role].append((one.memory_full_info().uss / 1e6, float(one.num_fds())))
+    return rows
+
+
+def _repeat(number: int, plant: Plant, end: threading.Event, done: list[int]) -> None:
+    while not end.wait(0.2):
+        with suppress(CellError, OSError, WebSocketException):
+            MIX[number](plant)
+            done[number] += 1
+
+
+def _mission(plant: Plant) -> None:
+    task = plant.client().post("/v1/missions", {"file": "demo"})
+    while plant.client().get(f"/v1/tasks/{task['id']}")["state"] not in FINAL:
+        time.sleep(0.5)
+
+
+def _reading(plant: Plant) -> None:
+    plant.client().fetch("GET", "/v1/devices/wrist_camera/reading?format=png")
+    plant.client().get("/v1/devices")
+
+
+def _listener(plant: Plant) -> None:
+    with connect(f"ws://127.0.0.1:{plant.port}/v1/stream", proxy=None, open_timeout=20) as stream:
+        for _ in range(20):
+            stream.recv(timeout=10.0)
+
+
+def _stop(plant: Plant) -> None:
+    time.sleep(60.0)
+    count = plant.stop_client().post("/v1/stop")["count"]
+    time.sleep(1.0)
+    plant.client().post("/v1/stop/reset", {"seen_count": count})
+
+
+def _nonsense(plant: Plant) -> None:
+    plant.client().post("/v1/missions", {"file": 5})
+
+
+MIX: tuple[Callable[[Plant], None], ...] = (_mission, _reading, _listener, _stop, _nonsense)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

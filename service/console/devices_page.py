@@ -35,7 +35,7 @@ def install(place: Place) -> None:
 
         with page_frame(place, "devices"), ui.element("section").classes("card"):
             ui.html(say("devices.heading"), sanitize=False, tag="h2")
-            listed = ui.html("", sanitize=False)
+            listed = ui.html("", sanitize=False).classes("stack")
             live(picks(listed, connect, what="connect"), values.table)
             live(
                 ui.html("", sanitize=False, tag="p").classes("quiet"),

@@ -149,7 +149,7 @@ def round_table(mirror: Mirror) -> str:
     """Return the rounds with what comes next, and a button to remove one that the cell file does not define."""
     rows = [_row(one, mirror) for one in mirror.said("rounds", {"rounds": []})["rounds"]]
     return table(
-        ["round", "mission", "times", "next", "newest", "deeds"],
+        ["round", "mission", "times", "next", "newest_run", "deeds"],
         rows,
         name=say("rounds.heading"),
         empty=say("rounds.none"),

@@ -86,7 +86,10 @@ class Cell:
     """A service of fakes with its console. A slider that is set or read is in the history afterwards."""
 
     def __init__(self, write_cell: WriteCell, folder: Path, *, keys: dict[str, Role] | None = None) -> None:
-        path = write_cell(robot=True)
+        self.trouble = folder / "trouble"  # while it says so, the lights do not connect
+        self.trouble.parent.mkdir(parents=True, exist_ok=True)
+        self.trouble.write_text("" if keys else "away")
+        path = write_cell(robot=True, options={"panel_lights": {"trouble": str(self.trouble)}})
         (path.parent / "panel.toml").write_text((path.parent / "panel.toml").read_text() + SLIDER)
         self.asked: list[SetRequest] = []
         holds = Operation(
@@ -104,7 +107,7 @@ class Cell:
             )
             for verb in ("manipulate", "inspect")
         }
-        options = Options(port=0, runs_dir=folder, inline=True, console=True)
+        options = Options(port=0, runs_dir=folder, inline=True, partial=True, console=True)
         self.service = Panelwright(load_cell(path), options, operations={**OPERATIONS, "missions": holds, **sets})
         book = self.service.service.keys
         self.secrets = {

@@ -6,51 +6,12 @@ import json
 import time
 from typing import Any
 
-from hal.panel.limits import Limits
 from tests.service.browser import NEEDS_CHROMIUM
 from tests.service.console.served import Cell, leave_mission, until
 from tests.service.history.test_store import reading
 from tests.service.waiting import eventually
 
 pytestmark = NEEDS_CHROMIUM
-
-
-def test_an_object_is_opened_read_and_set_only_after_a_yes(page: Any, cell: Cell) -> None:
-    cell.asked.clear()
-    page.click("g[data-object=setpoint]")
-    page.click("button:text-is('Read now')")
-    until(page, "document.querySelector('.dialog').textContent.includes('done. It shows 7.0 %')")
-    page.fill(".dialog input", "300")
-    page.click(".dialog button:text-is('Set to …')")
-    until(page, "document.querySelector('.dialog').textContent.includes('Give a number from 0 to 100')")
-    page.fill(".dialog input", "62")
-    page.click(".dialog button:text-is('Set to …')")
-    until(page, "document.querySelector('.dialog').textContent.includes('works it from 7.0 % to 62 %')")
-    assert len(cell.asked) == 1, "nothing moves before the yes"
-    page.click("button:text-is('Yes, move')")
-    until(page, "document.querySelector('#dialog-value').textContent === '62.0 %'")
-    assert [(one.object, one.value) for one in cell.asked[1:]] == [("setpoint", 62.0)]
-    page.click("button:text-is('Close')")
-    page.wait_for_selector(".dialog", state="hidden")
-
-
-def test_a_limit_is_set_and_its_alarm_is_seen(page: Any, cell: Cell) -> None:
-    cell.record(50.0)
-    page.goto(cell.url)
-    page.click("g[data-object=setpoint]")
-    until(page, "document.querySelector('.dialog').textContent.includes('beyond high 90 %')")
-    page.click("button:text-is('Limits …')")
-    page.fill("input[aria-label='high %']", "40")
-    page.click("button:text-is('Save limits')")
-    until(page, "document.querySelector('.dialog').textContent.includes('setpoint shows 50 %, above high 40')")
-    assert cell.service.service.plant.panel.object("setpoint").limits == Limits(high=40.0)
-    page.click("button:text-is('Limits …')")
-    page.click("button:text-is('Those of the panel file')")
-    until(page, "document.querySelector('.dialog').textContent.includes('Over, but not acknowledged')")
-    until(page, "document.querySelector('.dialog').textContent.includes('beyond high 90 %')")
-    for alarm in cell.service.service.plant.alarms.all():
-        if alarm.state == "returned-unacknowledged":
-            cell.service.service.plant.alarms.acknowledge(alarm.id, by="cleaner")
 
 
 def test_an_alarm_is_acknowledged_and_shelved_with_a_reason(page: Any, cell: Cell) -> None:

@@ -143,7 +143,8 @@ def _drawn_gauges(seeds: range, way_of: Callable[[int], Way], *, ends: bool, sca
         way = way_of(seed)
         drawn = draw_manometer(seed, way)
         given = {"scale": scale, **told, **({"ends_rad": _ends(way)} if ends else {})}
-        yield Case(image=drawn.image, read=partial(_gauge, **given), truth=drawn.reading, within=10 * GAUGE_WITHIN)
+        truth = drawn.red if told.get("pointer") == "red" and drawn.red is not None else drawn.reading
+        yield Case(image=drawn.image, read=partial(_gauge, **given), truth=truth, within=10 * GAUGE_WITHIN)
 
 
 def any_way(seed: int) -> Way:
@@ -185,6 +186,9 @@ def drawn_sets(first: int, count: int) -> Iterator[tuple[str, float, Iterable[Ca
         _drawn_gauges(seeds, falling, ends=False, scale=(10.0, 0.0)),
     )
     yield "drawn: falling gauges, not told", 0.0, _drawn_gauges(seeds, falling, ends=False)
+    for pointer in ("black", "red"):
+        cases = _drawn_gauges(seeds, red, ends=True, pointer=pointer)
+        yield f"drawn: two pointers, {pointer} asked", PASS["two pointers"], cases
     yield "drawn: two pointers, none asked", 0.0, _drawn_gauges(seeds, red, ends=True)
     yield "drawn: dials", PASS["dials"], _drawn_dials(seeds, falls=False, scale=(0.0, 10.0))
     yield "drawn: falling dials, told so", PASS["dials"], _drawn_dials(seeds, falls=True, scale=(10.0, 0.0))

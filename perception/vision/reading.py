@@ -77,8 +77,19 @@ A = TypeVar("A", bound=Answer)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SeenPointer:
+    """One of several pointers on a face: its colour, its length as a share of the face's radius, and its value."""
+
+    colour: str
+    length: float
+    value: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PatchReading(Answer):
-    """Reading of the object in a patch."""
+    """Reading of the object in a patch; `pointers` are those of a gauge that has more than one."""
+
+    pointers: tuple[SeenPointer, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -27,6 +27,13 @@ class InstrumentKind(StrEnum):
     DISPLAY = "display"
 
 
+class PointerColour(StrEnum):
+    """Pointers that can be asked for where a gauge has two."""
+
+    BLACK = "black"
+    RED = "red"
+
+
 def read(
     photo: Annotated[Path, typer.Argument(help="PNG, JPEG or BMP, cropped to the instrument.")],
     *,
@@ -36,12 +43,17 @@ def read(
             help="gauge: scale over part of a turn; dial: full turn from straight up; display: seven segments."
         ),
     ],
-    scale: Annotated[str | None, typer.Option(help="Values at the ends of the scale, e.g. 0..10.")] = None,
+    scale: Annotated[
+        str | None, typer.Option(help="Values at the ends of the scale, clockwise, e.g. 0..10, or 10..0.")
+    ] = None,
     ends: Annotated[
         str | None,
         typer.Option(
             help="Pointer angles at the ends, degrees clockwise from up, e.g. -135..135; read from the ticks if not given."
         ),
+    ] = None,
+    pointer: Annotated[
+        PointerColour | None, typer.Option(help="Which pointer is read if a red one stands beside another one.")
     ] = None,
     unit: Annotated[str, typer.Option(help="Unit of the scale.")] = "",
     scene: Annotated[bool, typer.Option("--scene", help="The picture is not cropped to the display.")] = False,
@@ -60,6 +72,7 @@ def read(
         kind.value,
         scale=_span(scale, "--scale"),
         ends_rad=None if ends_deg is None else (math.radians(ends_deg[0]), math.radians(ends_deg[1])),
+        pointer=None if pointer is None else pointer.value,
         unit=unit,
         is_scene=scene,
         least_confidence=least_confidence,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.schema.results import PhotographGuess, PhotographReading
+from service.schema.results import PhotographGuess, PhotographPointer, PhotographReading
 
 if TYPE_CHECKING:
     from perception.vision import PhotographKind
@@ -24,8 +24,8 @@ def read_stored_photograph(images: ImageStore, request: ReadPhotographRequest) -
         NotObservable: no instrument can be read in the image.
     """
     return read_pixels(
-        images.pixels(request.image), request.kind, scale=request.scale, ends_rad=request.ends_rad, unit=request.unit,
-        is_scene=request.is_scene, least_confidence=request.least_confidence,
+        images.pixels(request.image), request.kind, scale=request.scale, ends_rad=request.ends_rad,
+        pointer=request.pointer, unit=request.unit, is_scene=request.is_scene, least_confidence=request.least_confidence,
     )  # fmt: skip
 
 
@@ -35,6 +35,7 @@ def read_pixels(
     *,
     scale: tuple[float, float] | None,
     ends_rad: tuple[float, float] | None,
+    pointer: Literal["black", "red"] | None = None,
     unit: str,
     is_scene: bool,
     least_confidence: float,
@@ -43,7 +44,13 @@ def read_pixels(
     from perception.vision import read_photograph
 
     found = read_photograph(
-        pixels, kind, scale=scale, ends_rad=ends_rad, is_scene=is_scene, least_confidence=least_confidence
+        pixels,
+        kind,
+        scale=scale,
+        ends_rad=ends_rad,
+        pointer=pointer,
+        is_scene=is_scene,
+        least_confidence=least_confidence,
     )
     guess = found.guess
     return PhotographReading(
@@ -56,4 +63,5 @@ def read_pixels(
         confidence=found.confidence,
         reason=found.reason,
         guess=None if guess is None else PhotographGuess.model_validate(guess),
+        pointers=tuple(PhotographPointer.model_validate(seen) for seen in found.pointers),
     )

@@ -228,12 +228,21 @@ class ReadPhotographRequest(Strict):
         ),
     ]
     scale: Annotated[
-        tuple[float, float] | None, Field(description="smallest and largest value of a gauge's or dial's scale")
+        tuple[float, float] | None,
+        Field(
+            description="values at the ends of a gauge's or dial's scale, clockwise: the greater one first if they fall"
+        ),
     ] = None
     ends_rad: Annotated[
         tuple[float, float] | None,
         Field(
             description="a gauge's pointer angles at the ends of the scale, clockwise from up; if null, read from its ticks"
+        ),
+    ] = None
+    pointer: Annotated[
+        Literal["black", "red"] | None,
+        Field(
+            description="which pointer is read if a red one stands beside another one; black is the one that is not red"
         ),
     ] = None
     unit: Annotated[str, Field(max_length=40, description="unit of the scale, repeated in the answer")] = ""

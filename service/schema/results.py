@@ -267,6 +267,14 @@ class PhotographGuess(Result):
     text: str | None
 
 
+class PhotographPointer(Result):
+    """One of several pointers of a gauge in a photograph."""
+
+    colour: Annotated[str, Field(description="black, white or red")]
+    length: Annotated[float, Field(description="from the middle to the tip, as a share of the face's radius")]
+    value: Annotated[float, Field(description="where it points, in `unit`")]
+
+
 class PhotographReading(Result):
     """The reading of an instrument in a photograph, or the reason why it cannot be read.
 
@@ -282,3 +290,6 @@ class PhotographReading(Result):
     confidence: float
     reason: Annotated[str | None, Field(description="why there is no answer, and what would help")]
     guess: PhotographGuess | None
+    pointers: Annotated[
+        tuple[PhotographPointer, ...], Field(description="the pointers of a gauge that has more than one; else empty")
+    ] = ()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hal.errors import InvalidRequest
 from perception.vision.photographs.dial import read_dial
+from perception.vision.photographs.hands import Pointer
 from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.reading import ANSWER_AT, PatchReading
 
@@ -21,6 +22,7 @@ def read_photograph(
     *,
     scale: tuple[float, float] | None = None,
     ends_rad: tuple[float, float] | None = None,
+    pointer: Pointer | None = None,
     is_scene: bool = False,
     least_confidence: float = ANSWER_AT,
 ) -> PatchReading:
@@ -29,12 +31,12 @@ def read_photograph(
     Args:
         image: (H, W) gray or (H, W, 3) RGB uint8.
         kind: `gauge`: a pointer over a part of a turn; `dial`: a pointer over a full turn that begins straight up, as
-        in a
-            water meter; `display`: seven-segment digits.
-        scale: least and greatest value of a gauge's or a dial's scale.
+            in a water meter; `display`: seven-segment digits.
+        scale: values at the ends of a gauge's or a dial's scale, in the clockwise sense; the first is the greater one
+            where the values fall clockwise.
         ends_rad: pointer angles of a gauge there, clockwise from straight up. If None, they are the ends of the ticks,
-        or
-            three quarters of a turn if these are not found.
+            or three quarters of a turn if these are not found.
+        pointer: which pointer is read where a red one stands beside another one; `black` is the one that is not red.
         is_scene: whether the display is somewhere in the picture, not cropped. The dial of a pointer must fill it.
         least_confidence: 0 to 1; less certain readings are refused, with a guess.
 
@@ -42,35 +44,40 @@ def read_photograph(
         InvalidRequest: a scale is missing, or given for a kind that has none; a bad image.
         NotObservable: the image is black or saturated.
     """
-    _check(kind, scale=scale, ends_rad=ends_rad, is_scene=is_scene)
+    _check(kind, scale=scale, ends_rad=ends_rad, pointer=pointer, is_scene=is_scene)
     if scale is None:
         return read_photographed_display(image, scene=is_scene, least_confidence=least_confidence)
     low, high = scale
     return read_dial(
-        image, minimum=low, maximum=high, circular=kind == "dial", ends_rad=ends_rad, least_confidence=least_confidence
-    )
+        image, minimum=low, maximum=high, circular=kind == "dial", ends_rad=ends_rad, pointer=pointer,
+        least_confidence=least_confidence,
+    )  # fmt: skip
 
 
 def _check(
-    kind: PhotographKind, *, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None, is_scene: bool
-) -> None:
-    """Check that scale, ends and scene suit the kind.
+    kind: PhotographKind, *, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None,
+    pointer: Pointer | None, is_scene: bool,
+) -> None:  # fmt: skip
+    """Check that scale, ends, pointer and scene suit the kind.
 
     Raises:
         InvalidRequest: they do not.
     """
     if kind == "display":
-        if scale is not None or ends_rad is not None:
-            raise InvalidRequest("a display has no scale", hint="leave scale and ends out, or say which kind it is")
+        if scale is not None or ends_rad is not None or pointer is not None:
+            raise InvalidRequest(
+                "a display has no scale and no pointer",
+                hint="leave scale, ends and pointer out, or say which kind it is",
+            )
         return
     if is_scene:
         raise InvalidRequest(f"a {kind} is not looked for in a scene", hint="crop the picture to the instrument")
     if scale is None:
         raise InvalidRequest(f"a {kind} is read by its scale", hint="give the values at its ends, for example 0 to 10")
-    if not np.isfinite(scale).all() or scale[0] >= scale[1]:
+    if not np.isfinite(scale).all() or scale[0] == scale[1]:
         raise InvalidRequest(
             f"a scale from {scale[0]:g} to {scale[1]:g} cannot be",
-            hint="the smaller value first; swap the pointer angles instead",
+            hint="give two different numbers, the values at its ends",
         )
     if ends_rad is None:
         return

@@ -11,7 +11,7 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from benchmarks.vision_manometers import draw_manometer
+from benchmarks.vision_manometers import Way, draw_manometer
 from hal.errors import InvalidRequest
 from perception.vision.warm import three_eights
 from service.cli import _app
@@ -41,6 +41,21 @@ def test_both_ways_give_the_same_reading(web: httpx2.Client, photo: Path) -> Non
     assert printed.exit_code == 0 and json.loads(printed.output) == told
     spoken = run("read", photo, "--kind", "gauge", "--scale", "0..10", "--unit", "bar")
     assert f"{told['value']:.4g} bar" in spoken.output
+
+
+def test_of_two_pointers_the_asked_one_is_read_both_ways(web: httpx2.Client, tmp_path: Path) -> None:
+    drawn = draw_manometer(200001, Way(has_red=True))
+    photo = tmp_path / "two.png"
+    cv2.imwrite(str(photo), cv2.cvtColor(drawn.image, cv2.COLOR_RGB2BGR))
+    image = web.post("/v1/images", content=photo.read_bytes(), headers={"Content-Type": "image/png"}).json()["id"]
+    body = {"image": image, "kind": "gauge", "scale": [0.0, 10.0], "ends_rad": [-2.356, 2.356]}
+    both = web.post("/v1/read-photograph", json=body).json()
+    assert not both["answered"] and "two pointers" in both["reason"]
+    assert {seen["colour"] for seen in both["pointers"]} == {"black", "red"}
+    red = web.post("/v1/read-photograph", json={**body, "pointer": "red"}).json()
+    assert red["value"] == pytest.approx(drawn.red, abs=0.25)
+    words = ("read", photo, "--kind", "gauge", "--scale", "0..10", "--ends=-134.99..134.99", "--pointer", "red")
+    assert float(run(*words).output.split()[0]) == pytest.approx(drawn.red, abs=0.25)
 
 
 def test_a_display_in_a_scene_is_read(web: httpx2.Client) -> None:

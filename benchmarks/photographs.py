@@ -30,6 +30,7 @@ from perception.vision.reading import PatchReading
 REAL = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "vision" / "real"
 SEED, COUNT = 200000, 60
 SURE = 0.8
+METER_NUMERAL = 0.007  # see `draw_dial`
 DIAL_WITHIN, GAUGE_WITHIN = 0.02, 0.025  # of the scale
 PASS = {
     "dials": 0.93, "manometers": 0.95, "counters": 0.40, "told the ends": 0.95, "told the scale": 0.85, "two pointers": 0.80,
@@ -155,9 +156,11 @@ def any_way(seed: int) -> Way:
     )
 
 
-def _drawn_dials(seeds: range, *, falls: bool, scale: tuple[float, float]) -> Iterator[Case]:
+def _drawn_dials(
+    seeds: range, *, falls: bool, scale: tuple[float, float], numeral: float = METER_NUMERAL
+) -> Iterator[Case]:
     for seed in seeds:
-        drawn: DrawnDial = draw_dial(seed, falls=falls, circular=True)
+        drawn: DrawnDial = draw_dial(seed, falls=falls, circular=True, numeral=numeral)
         yield Case(image=drawn.image, read=partial(_dial, scale=scale), truth=drawn.reading, within=10 * DIAL_WITHIN,
                    circle=10.0)  # fmt: skip
 
@@ -193,6 +196,8 @@ def drawn_sets(first: int, count: int) -> Iterator[tuple[str, float, Iterable[Ca
     yield "drawn: dials", PASS["dials"], _drawn_dials(seeds, falls=False, scale=(0.0, 10.0))
     yield "drawn: falling dials, told so", PASS["dials"], _drawn_dials(seeds, falls=True, scale=(10.0, 0.0))
     yield "drawn: falling dials, not told", 0.0, _drawn_dials(seeds, falls=True, scale=(0.0, 10.0))
+    tiny = _drawn_dials(seeds, falls=True, scale=(0.0, 10.0), numeral=0.0022)
+    yield "drawn: falling dials, tiny numerals", 0.0, tiny
     for kind in PHOTOGRAPHS:
         yield f"drawn: displays, {kind}", PASS[kind], _drawn_displays(seeds, kind)
     many = range(first, first + 4 * count)

@@ -40,12 +40,13 @@ class DrawnDial:
     red: float | None = None
 
 
-def draw_dial(seed: int, *, falls: bool = False, circular: bool | None = None) -> DrawnDial:
+def draw_dial(seed: int, *, falls: bool = False, circular: bool | None = None, numeral: float = 0.0022) -> DrawnDial:
     """Draw a dial of random design, the same for the same seed.
 
     Args:
         falls: whether the numerals run counter-clockwise.
         circular: whether the scale is a full turn; None: by the seed.
+        numeral: size of the numerals, as OpenCV's font scale over the radius in px; 0.007 is usual on water meters.
     """
     rng = np.random.default_rng(seed)
     by_seed, share = bool(rng.random() < 0.5), float(rng.uniform(0.02, 0.98))
@@ -54,7 +55,7 @@ def draw_dial(seed: int, *, falls: bool = False, circular: bool | None = None) -
     ink = (230, 230, 230) if sum(face) < 200 else (35, 35, 40)
     pen = Pen.on(rng, face)
     way = -1.0 if falls else 1.0
-    _scale(pen, rng, ink, circular, way)
+    _scale(pen, rng, ink, circular, way, numeral)
     angle = way * (share * 2 * np.pi if circular else (share - 0.5) * SPAN_RAD)
     colour = ink if rng.random() < 0.35 else COLOURS[int(rng.integers(len(COLOURS)))]
     shape = str(rng.choice(SHAPES))
@@ -97,15 +98,16 @@ class Pen:
         cv2.fillPoly(self.canvas, [np.array([self.place(angle_rad, c) for c in corners])], colour, cv2.LINE_AA, 4)
 
 
-def _scale(pen: Pen, rng: Rng, ink: Colour, circular: bool, way: float) -> None:
-    numerals, size = float(rng.uniform(0.62, 0.70)), 0.0022 * pen.radius
+def _scale(pen: Pen, rng: Rng, ink: Colour, circular: bool, way: float, numeral: float) -> None:
+    numerals, size = float(rng.uniform(0.62, 0.70)), numeral * pen.radius
+    thick = max(6, round(2.5 * size))
     for k in range(10 if circular else 11):
         angle = way * (k / 10 * 2 * np.pi if circular else (k / 10 - 0.5) * SPAN_RAD)
         pen.fill(angle, [(0.80, -0.012), (0.80, 0.012), (0.93, 0.012), (0.93, -0.012)], ink)
         x, y = pen.place(angle, (numerals, 0.0))
-        (w, h), _ = cv2.getTextSize(str(k), cv2.FONT_HERSHEY_SIMPLEX, size, 6)
+        (w, h), _ = cv2.getTextSize(str(k), cv2.FONT_HERSHEY_SIMPLEX, size, thick)
         at = (x // 16 - w // 2, y // 16 + h // 2)
-        cv2.putText(pen.canvas, str(k), at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, 6, cv2.LINE_AA)
+        cv2.putText(pen.canvas, str(k), at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thick, cv2.LINE_AA)
 
 
 def _pointer(pen: Pen, rng: Rng, angle: float, shape: str, colour: Colour, ink: Colour) -> None:

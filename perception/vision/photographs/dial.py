@@ -5,6 +5,8 @@ The search for its pointers is in `hands`, that for the ends of its scale in `sc
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -18,6 +20,7 @@ from hal.panel import Scale
 from perception.vision.image import as_gray
 from perception.vision.photographs.dial_outline import SIDE_PX, dial_circle
 from perception.vision.photographs.hands import Pointer, confidence_of, find_hands
+from perception.vision.photographs.numeral_direction import numerals_run
 from perception.vision.photographs.scale_ends import scale_ends
 from perception.vision.reading import ANSWER_AT, PatchReading, SeenPointer, answer_at, doubted, gated, limited, refused
 from perception.vision.status.gauge import status_of_pointer
@@ -29,7 +32,10 @@ USUAL_RAD = np.deg2rad(10.0)  # ticks that end so near to that mean it, with one
 SAME_SPAN_RAD, TURNED_RAD = np.deg2rad([5.0, 3.0])
 # If the middle of another span is farther from straight up, the ticks at one end are not visible.
 LOPSIDED_RAD = np.deg2rad(10.0)
-BY_TICKS = 0.75  # largest confidence if an end may be off by one tick, or if no tick confirms the usual ends
+BY_NUMERALS = 0.75  # largest confidence if the numerals run against what was told, or are not legible
+BY_TICKS = (
+    0.75  # largest confidence if the ends are not told: one may be off by a tick, or the values may fall clockwise
+)
 
 
 def read_dial(
@@ -44,8 +50,7 @@ def read_dial(
             minimum above the maximum says that the values fall clockwise.
         circular: whether the scale is a full turn that begins straight up.
         ends_rad: pointer angles at minimum and maximum of a scale that is not circular. If None, they are the ends of
-        the
-            ticks, or three quarters of a turn if these are not found.
+            the ticks, or three quarters of a turn if these are not found.
         pointer: which one is read if there is a red one beside another one; `black` is the one that is not red.
         least_confidence: as of `inspection.inspect`.
 
@@ -56,17 +61,10 @@ def read_dial(
     hands = find_hands(picture, circle, pointer)
     if isinstance(hands, str):
         return refused(hands)
-    most_of_scale = 1.0
-    if circular:
-        status_of = partial(_on_full_turn, minimum=minimum, maximum=maximum)
-    else:
-        (low, high), most_of_scale = (ends_rad, 1.0) if ends_rad else _ends(as_gray(picture), *circle)
-        rising = minimum < maximum
-        scale = Scale(
-            minimum=min(minimum, maximum), maximum=max(minimum, maximum), unit="", at_min=low if rising else high,
-            at_max=high if rising else low,
-        )  # fmt: skip
-        status_of = partial(status_of_pointer, scale=scale, seen=1.0)
+    scale = _scale_of(as_gray(picture), circle, (minimum, maximum), ends_rad, circular=circular)
+    if isinstance(scale, str):
+        return refused(scale)
+    status_of, most_of_scale = scale
     seen = tuple(
         SeenPointer(colour=hand.colour, length=hand.length, value=shown.value)
         for hand in hands
@@ -76,6 +74,35 @@ def read_dial(
     if len(hands) > 1 and pointer is None:
         return doubted(status, _which_is_meant(seen))
     return answer_at(gated(status), least_confidence)
+
+
+def _scale_of(
+    gray: Image, circle: tuple[float, float, float], values: tuple[float, float], ends_rad: tuple[float, float] | None,
+    *, circular: bool,
+) -> tuple[Callable[[PointerFit], PatchReading], float] | str:  # fmt: skip
+    """Return what a pointer shows, and the largest confidence that the scale justifies; or why it cannot be the scale.
+
+    Without the angles of its ends nothing says that the values rise clockwise, unless the numerals are legible.
+    """
+    first, last = values
+    if circular:
+        run = numerals_run(gray, *circle) if _has_ten_numerals(first, last) else 0
+        if first > last and run > 0:
+            return (
+                f"the numerals run clockwise, so {first:g} to {last:g} is not their scale: give the least value first"
+            )
+        told = first > last or run > 0
+        ends = (last, first) if run < 0 and first < last else values
+        return partial(_on_full_turn, minimum=ends[0], maximum=ends[1]), 1.0 if told else BY_NUMERALS
+    low, high = ends_rad or _ends(gray, *circle)
+    at_min, at_max = (low, high) if first < last else (high, low)
+    scale = Scale(minimum=min(values), maximum=max(values), unit="", at_min=at_min, at_max=at_max)
+    return partial(status_of_pointer, scale=scale, seen=1.0), 1.0 if ends_rad else BY_TICKS
+
+
+def _has_ten_numerals(first: float, last: float) -> bool:
+    """Return whether a full turn shows the digits 0 to 9, possibly followed by zeros or times a power of ten."""
+    return 0.0 in (first, last) and math.log10(abs(last - first)) % 1.0 == 0.0
 
 
 def _on_full_turn(fit: PointerFit, *, minimum: float, maximum: float) -> PatchReading:
@@ -101,15 +128,14 @@ def _at_reading_size(image: NDArray[Any]) -> tuple[Image, tuple[float, float, fl
     return picture, dial_circle(as_gray(image), scale)
 
 
-def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[tuple[float, float], float]:
-    """Return the pointer angles at minimum and maximum, and the largest confidence that they justify."""
+def _ends(gray: Image, u: float, v: float, radius: float) -> tuple[float, float]:
+    """Return the pointer angles at the ends of the scale by its ticks, or the usual ones."""
     usual = (-SCALE_END_RAD, SCALE_END_RAD)
     by_ticks = scale_ends(gray, u, v, radius)
     if by_ticks is None:
-        return usual, BY_TICKS
+        return usual
     wider_rad, turned_rad = by_ticks[1] - by_ticks[0] - 2 * SCALE_END_RAD, 0.5 * (by_ticks[0] + by_ticks[1])
     if abs(wider_rad) < SAME_SPAN_RAD and abs(turned_rad) > TURNED_RAD:
-        return (usual[0] + turned_rad, usual[1] + turned_rad), BY_TICKS
-    if 0.5 * abs(wider_rad) + abs(turned_rad) < USUAL_RAD:
-        return usual, 1.0
-    return (usual if abs(turned_rad) > LOPSIDED_RAD else by_ticks), BY_TICKS
+        return usual[0] + turned_rad, usual[1] + turned_rad
+    nearly_usual = 0.5 * abs(wider_rad) + abs(turned_rad) < USUAL_RAD
+    return usual if nearly_usual or abs(turned_rad) > LOPSIDED_RAD else by_ticks

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import InvalidRequest
+from perception.vision.image import check_image
 from perception.vision.photographs.dial import read_dial
 from perception.vision.photographs.hands import Pointer
 from perception.vision.photographs.photo_display import read_photographed_display
@@ -45,6 +46,7 @@ def read_photograph(
         NotObservable: the image is black or saturated.
     """
     _check(kind, scale=scale, ends_rad=ends_rad, pointer=pointer, is_scene=is_scene)
+    check_image(image)
     if scale is None:
         return read_photographed_display(image, scene=is_scene, least_confidence=least_confidence)
     low, high = scale

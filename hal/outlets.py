@@ -13,18 +13,32 @@ Host = Annotated[str, Field(min_length=1, max_length=253)]
 TopicLevel = Annotated[str, Field(pattern=r"^[^/+#\x00-\x1f]{1,100}$")]
 
 
-class MqttSection(Strict):
-    """`[outlets.mqtt]`: readings and alarms as retained messages of a broker."""
+class BrokerSection(Strict):
+    """Where an MQTT broker is, and how to log in."""
 
     host: Host
     port: Port = 1883
-    topic: Annotated[TopicLevel, Field(description="first level of all topics")] = "panelwright"
     username: str | None = None
     password_file: Annotated[str | None, Field(description="file with the password, which only its owner may read")] = (
         None
     )
     tls: Annotated[bool, Field(description="encrypt, and check the broker's certificate")] = False
     ca_file: Annotated[str | None, Field(description="certificate to trust, instead of the system's; with tls")] = None
+
+
+class MqttSection(BrokerSection):
+    """`[outlets.mqtt]`: readings and alarms as retained messages of a broker."""
+
+    topic: Annotated[TopicLevel, Field(description="first level of all topics")] = "panelwright"
+
+
+class SparkplugSection(BrokerSection):
+    """`[outlets.sparkplug]`: the cell as an edge node of Sparkplug B, with its panel as the device."""
+
+    group: Annotated[TopicLevel, Field(description="id of the group, the second level of all topics")]
+    primary_host: Annotated[
+        TopicLevel | None, Field(description="id of the host application; while it is offline the node waits")
+    ] = None
 
 
 class WebhookSection(Strict):
@@ -83,6 +97,7 @@ class OutletsSection(Strict):
     webhook: WebhookSection | None = None
     prometheus: PrometheusSection | None = None
     opcua: OpcuaSection | None = None
+    sparkplug: SparkplugSection | None = None
 
     @property
     def is_empty(self) -> bool:

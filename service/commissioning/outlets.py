@@ -9,15 +9,20 @@ from pathlib import Path
 from hal.outlets import OutletsSection
 from hal.strict import FieldFault, refusal
 
-EXTRAS = {"mqtt": ("aiomqtt", "mqtt"), "opcua": ("asyncua", "opcua")}  # outlet: package, extra
+EXTRAS = {
+    "mqtt": ("aiomqtt", "mqtt"),
+    "sparkplug": ("aiomqtt", "mqtt"),
+    "opcua": ("asyncua", "opcua"),
+}  # outlet: package, extra
 SECRETS = (
     ("mqtt", "password_file"),
+    ("sparkplug", "password_file"),
     ("webhook", "secret_file"),
     ("opcua", "password_file"),
     ("opcua", "private_key_file"),
     ("opcua", "key_file"),
 )
-FILES = (*SECRETS, ("mqtt", "ca_file"), ("opcua", "certificate_file"))
+FILES = (*SECRETS, ("mqtt", "ca_file"), ("sparkplug", "ca_file"), ("opcua", "certificate_file"))
 
 
 def checked_outlets(section: OutletsSection, folder: Path, *, source: str = "[outlets]") -> OutletsSection:

@@ -10,12 +10,12 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import ssl
 from typing import Any
 
 import aiomqtt
 
 from hal.outlets import MqttSection
+from service.outlets.broker import client_of
 from service.outlets.deliver import Backoff, Sleep, batches
 from service.outlets.source import Changes, CursorFile, Source, told
 
@@ -59,17 +59,8 @@ class MqttOutlet:
                 await backoff.pause()
 
     def _client(self) -> aiomqtt.Client:
-        tls = ssl.create_default_context(cafile=self._section.ca_file) if self._section.tls else None
-        return aiomqtt.Client(
-            self._section.host,
-            self._section.port,
-            username=self._section.username,
-            password=self._password,
-            identifier=f"panelwright-{self._cell}",
-            will=aiomqtt.Will(f"{self._root}/status", _status("offline"), QOS, retain=True),
-            tls_context=tls,
-            keepalive=20,
-        )
+        will = aiomqtt.Will(f"{self._root}/status", _status("offline"), QOS, retain=True)
+        return client_of(self._section, f"panelwright-{self._cell}", will, self._password)
 
     async def _publish_all(self, client: aiomqtt.Client) -> None:
         async def say(topic: str, message: Any) -> None:

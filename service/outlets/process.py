@@ -57,6 +57,19 @@ def outlets_of(section: OutletsSection, *, cell: str, source: Source, folder: Pa
         from service.outlets.prometheus import PrometheusOutlet
 
         found.append(PrometheusOutlet(section.prometheus, cell=cell, source=source).run)
+    if section.sparkplug is not None:
+        from service.outlets.sparkplug import SparkplugOutlet
+
+        found.append(
+            SparkplugOutlet(
+                section.sparkplug,
+                cell=cell,
+                source=source,
+                cursor=CursorFile(folder / "sparkplug.json"),
+                births=folder / "sparkplug-births",
+                password=password_of(section.sparkplug),
+            ).run
+        )
     if section.opcua is not None:
         from service.outlets.opcua import OpcuaOutlet
 

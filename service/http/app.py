@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
-from starlette.responses import JSONResponse
+from starlette.responses import FileResponse, JSONResponse
 from starlette.types import ASGIApp
 
 from service.core import Service
@@ -112,6 +112,7 @@ def create_app(
     for router in routers:
         app.include_router(router)
     app.add_api_route("/openapi.json", _api_document, include_in_schema=False)
+    app.add_api_route("/docs", _docs_page, include_in_schema=False)
     install(app, paths=[getattr(route, "path", "") for router in routers for route in router.routes])
     app.mount("/", Page(WEB, app.routes), name="page")
     bodies = [operation.request_model for operation in service.operations.values()]
@@ -167,6 +168,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     state.hub.close()
     for pool in (state.pool, state.control_pool, state.stop_pool):
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+async def _docs_page() -> FileResponse:
+    return FileResponse(WEB / "docs.html")
 
 
 async def _api_document(request: Request) -> JSONResponse:

@@ -22,7 +22,8 @@ from manipulation.skills.outcome import (
     surely_within,
 )
 from manipulation.skills.repeat import perform
-from manipulation.skills.wheel_hold import Belief, Hold, behind_two_spokes, hold_across, hold_the_rim
+from manipulation.skills.wheel_belief import Belief, Hold
+from manipulation.skills.wheel_hold import behind_two_spokes, hold_across, hold_the_rim
 from manipulation.skills.wheel_turn import WheelTurn
 
 DRAGGED_RAD = 0.2  # largest turn by which a hand that lets go drags the wheel back
@@ -145,11 +146,10 @@ def _turn_on(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Be
     """
     begun_rad, hand = where.known, attempt.context.hand
     belief.learn(begun_rad)
+    belief.begin(begun_rad)
     hold = belief.next_hold(wheel, hand)
     if hold is None:
-        raise SkillFailure(
-            Outcome.SLIPPED, f"the wheel followed the hand in no hold, at up to {belief.effort_nm:.1f} N m"
-        )
+        raise _given_up(belief, begun_rad)
     try:
         _turn_once(attempt, wheel, where, belief, hold, target_rad - begun_rad)
     except Unreachable:
@@ -163,18 +163,28 @@ def _turn_on(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Be
                 raise
             belief.failed.clear()
             return
-        if failure.outcome not in (Outcome.STIFF, Outcome.SLIPPED) or belief.next_hold(wheel, hand) is None:
+        if failure.outcome not in (Outcome.STIFF, Outcome.SLIPPED):
             raise
         if where.verify is not None:
             where.verify()
+        if belief.next_hold(wheel, hand) is None:
+            raise _given_up(belief, where.known) from failure
         return
     if where.verify is None or abs(target_rad - where.known) <= 0.3 * TOLERANCE_RAD:
         return
-    felt_rad = abs(where.known - begun_rad)
     missing_rad = belief.learn(where.known) if where.verify() is not None else 0.0
     if missing_rad and belief.next_hold(wheel, hand) is None:
-        turned = f"the wheel turned by {where.known - begun_rad:.2f} rad while the fingers felt {felt_rad:.2f} rad"
-        raise SkillFailure(Outcome.SLIPPED, turned)
+        raise _given_up(belief, where.known)
+
+
+def _given_up(belief: Belief, seen_rad: float) -> SkillFailure:
+    """Return the failure of a wheel that no hold turns (any more), with the largest torque that it was turned with."""
+    names = ", ".join(sorted(belief.failed))
+    if belief.has_moved(seen_rad):
+        return SkillFailure(
+            Outcome.SLIPPED, f"the wheel stopped following the hand at {belief.tried_nm:.1f} N m (holds: {names})"
+        )
+    return SkillFailure(Outcome.STIFF, f"it did not give way at {belief.tried_nm:.1f} N m (holds: {names})")
 
 
 def _turn_once(
@@ -202,11 +212,13 @@ def _turn_once(
     try:
         turn.turn(part_rad)
         _note(where, turn, sign)
+        belief.felt(turn.felt_nm)
         belief.effort_nm = turn.felt_nm
         belief.turned(hold, angle_rad, where.known)
     except SkillFailure as failure:
         _note(where, turn, sign)
         where.moved_to(at_a_stop(wheel, where.known, sign, failure.outcome))
+        belief.felt(turn.felt_nm)
         belief.effort_nm = max(belief.effort_nm, turn.felt_nm)
         if failure.outcome is Outcome.SLIPPED:
             belief.slipped(hold)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -17,9 +15,10 @@ from manipulation.planning.hand import Hand
 from manipulation.skills.attempt import STANDOFF_M, Attempt
 from manipulation.skills.contact import centre_between
 from manipulation.skills.context import panel_from_grip
-from manipulation.skills.crank import SpokeHold, spoke_holds
+from manipulation.skills.crank import SpokeHold
 from manipulation.skills.landing import come_down
 from manipulation.skills.outcome import Outcome, SkillFailure
+from manipulation.skills.wheel_belief import FRICTION, PUSH_N, SIDE_N, SPARE_M, Belief, across_gap_m, outer_m
 from manipulation.skills.wheel_turn import HEAVY_M_PER_S, HEAVY_N, LAG_RAD, TURN_M_PER_S, WheelTurn
 
 TIP_DEPTH_M = 0.014  # depth of the tips below the middle of the spokes
@@ -31,20 +30,10 @@ HOLDS_RAD = (
 )  # largest turns of one hold that are tried, in this order; the arm's wrist allows one of them
 RIM_HOLDS_RAD = (1.7, 0.9)
 INF = float("inf")
-PUSH_N = 75.0  # of one finger on a spoke
-SIDE_N = 54.0  # of the hand on the rim; where the pads slip, the finger beside a spoke takes all of it, and is pressed past it
 RIM_SIDE_M = 0.009  # largest free space between each finger and the rim when approaching
-SPARE_M = 0.001
-ACROSS_SIDE_M, LEAST_ACROSS_M = 0.006, 0.002  # wanted and least free space on each side of a hand across the wheel
 ACROSS_RAD = tuple(float(a) for a in np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False))  # angles at which it may begin
 ACROSS_LAG_RAD = 0.3
-POOR_FRICTION = 0.3  # of pads on paint, with which the first grip across a wheel reckons
-SPARE_GRIP = 1.3
-GRIP_ACROSS_N = (20.0, 90.0)  # the force of one pad is taken by the other, so neither arm nor shaft feel it
-SLACK_RAD = 0.03
-LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand
 SPOKE_GAP_M = 0.0025  # between the inner finger and the spoke beside which it holds the rim
-FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
 GRIP_N = (12.0, 25.0)  # smallest and largest force of the pads; with 45 N friction along the fingers reached 70 N
 LIGHT_N, SETTLE_S, SETTLES = 8.0, 0.4, 6
 GRIP_STEP_N = 20.0
@@ -57,89 +46,6 @@ SIDEWAYS = Compliance(
     mass=(60.0, 60.0, 400.0) + (1.0,) * 3,
     max_offset_m=0.006,
 )  # fmt: skip
-
-
-class Hold(StrEnum):
-    """How a hand holds a wheel."""
-
-    ACROSS = "across"
-    SPOKES = "spokes"
-    RIM = "rim"
-
-
-@dataclass(slots=True, kw_only=True)
-class Belief:
-    """What is believed of a wheel: its effort, by the panel file until it is felt, and which holds have failed.
-
-    Attributes:
-        effort_nm: torque that moves the wheel, or the largest that did not.
-        failed: holds that were tried in vain.
-        grip_n: force of the pads across the wheel; None until the first such hold.
-    """
-
-    effort_nm: float
-    failed: set[Hold] = field(default_factory=set)
-    grip_n: float | None = None
-    _last: tuple[Hold, float, float] | None = None
-
-    def next_hold(self, wheel: Handwheel, hand: Hand) -> Hold | None:
-        """Return the hold to try: of those that have not failed, the first that takes the effort, or takes most of it."""
-        takes = {hold: nm for hold, nm in torques_nm(wheel, hand).items() if hold not in self.failed}
-        enough = [hold for hold, nm in takes.items() if nm > self.effort_nm]
-        return enough[0] if enough else max(takes, key=lambda hold: takes[hold], default=None)
-
-    def grip_across_n(self, wheel: Handwheel) -> float:
-        """Return the force of the pads across the wheel: for the believed effort at first, and the largest after a slip."""
-        if self.grip_n is None:
-            self.grip_n = float(
-                np.clip(SPARE_GRIP * self.effort_nm / (2.0 * POOR_FRICTION * _outer_m(wheel)), *GRIP_ACROSS_N)
-            )
-        return self.grip_n
-
-    def turned(self, hold: Hold, begun_rad: float, expected_rad: float) -> None:
-        """Note that a hold has turned the wheel, by what the fingers felt."""
-        self._last = (hold, begun_rad, expected_rad)
-
-    def learn(self, seen_rad: float) -> float:
-        """Compare what the last hold felt with what is seen; returns the turn that is missing, 0 if it is small.
-
-        A hold that slipped has failed; across the wheel only with the largest force of the pads.
-        """
-        if self._last is None:
-            return 0.0
-        (hold, begun_rad, expected_rad), self._last = self._last, None
-        felt_rad, moved_rad = abs(expected_rad - begun_rad), abs(seen_rad - begun_rad)
-        if moved_rad >= LEAST_SHARE * felt_rad - SLACK_RAD:
-            return 0.0
-        self.slipped(hold)
-        return felt_rad - moved_rad
-
-    def slipped(self, hold: Hold) -> None:
-        """Note that the pads slipped."""
-        if hold is Hold.ACROSS and (self.grip_n or 0.0) < 0.9 * GRIP_ACROSS_N[1]:
-            self.grip_n = GRIP_ACROSS_N[1]
-        else:
-            self.failed.add(hold)
-
-
-def torques_nm(wheel: Handwheel, hand: Hand) -> dict[Hold, float]:
-    """Return the torque that each possible hold of a wheel takes, the best hold first."""
-    takes: dict[Hold, float] = {}
-    if across_gap_m(wheel, hand) >= LEAST_ACROSS_M:
-        takes[Hold.ACROSS] = 2.0 * FRICTION * GRIP_ACROSS_N[1] * _outer_m(wheel)
-    if holds := spoke_holds(wheel, hand, 0.0, 1.0):
-        takes[Hold.SPOKES] = 2.0 * PUSH_N * holds[0].arm_m
-    takes[Hold.RIM] = SIDE_N * wheel.radius_m
-    return takes
-
-
-def across_gap_m(wheel: Handwheel, hand: Hand) -> float:
-    """Return the free space between each finger and the rim of a hand that is open across the wheel; may be negative."""
-    return min(ACROSS_SIDE_M, 0.5 * (hand.max_width_m - SPARE_M) - _outer_m(wheel))
-
-
-def _outer_m(wheel: Handwheel) -> float:
-    return wheel.radius_m + wheel.rim_m
 
 
 def hold_across(
@@ -156,12 +62,12 @@ def hold_across(
         steps = _steps(sign * (part + ACROSS_LAG_RAD))
         return [[at(angle_rad + start, top), *(at(angle_rad + start + a, low) for a in steps)] for start in ACROSS_RAD]
 
-    width = 2.0 * (_outer_m(wheel) + across_gap_m(wheel, hand))
+    width = 2.0 * (outer_m(wheel) + across_gap_m(wheel, hand))
     _, part = _begin(attempt, wheel, span_rad, HOLDS_RAD, width, ways)
     come_down(attempt, STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, what="the wheel")
     _squeeze(attempt, belief.grip_across_n(wheel), least_m=1.6 * wheel.radius_m, what="wheel")
     turn = WheelTurn(
-        attempt=attempt, wheel=wheel, sign=sign, behind_rad=0.0, most_nm=2.0 * PUSH_N * _outer_m(wheel),
+        attempt=attempt, wheel=wheel, sign=sign, behind_rad=0.0, most_nm=2.0 * PUSH_N * outer_m(wheel),
         up_m=STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, open_m=width, is_across=True,
     )  # fmt: skip
     return turn, part

@@ -6,7 +6,9 @@ import pytest
 
 from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
-from manipulation.skills.wheel_hold import GRIP_ACROSS_N, Belief, Hold, across_gap_m, torques_nm
+from manipulation.skills.handwheel import _given_up
+from manipulation.skills.outcome import Outcome
+from manipulation.skills.wheel_belief import GRIP_ACROSS_N, Belief, Hold, across_gap_m, torques_nm
 
 HAND = Hand()
 SMALL = Handwheel(name="w", position_m=(0.0, 0.0), radius_m=0.030, spokes=3)
@@ -59,3 +61,13 @@ def test_a_wheel_that_followed_at_least_half_way_has_not_slipped(seen_rad: float
 
 def test_what_was_not_turned_teaches_nothing() -> None:
     assert Belief(effort_nm=0.5).learn(3.0) == 0.0
+
+
+def test_a_wheel_that_never_moved_is_named_stiff_with_the_largest_torque_and_one_that_did_slipped() -> None:
+    belief = Belief(effort_nm=0.8, failed=set(Hold))
+    belief.begin(1.0)
+    for torque_nm in (2.1, 2.9, 1.4):
+        belief.felt(torque_nm)
+    still, moved = _given_up(belief, 1.05), _given_up(belief, 1.6)
+    assert (still.outcome, moved.outcome) == (Outcome.STIFF, Outcome.SLIPPED)
+    assert "2.9 N m (holds: across, rim, spokes)" in still.cause

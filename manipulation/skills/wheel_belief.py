@@ -1,0 +1,124 @@
+"""What is believed of a handwheel while it is turned: its effort, and which of the ways to hold it is to be tried next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from hal.panel import Handwheel
+from manipulation.planning.hand import Hand
+from manipulation.skills.crank import spoke_holds
+from manipulation.skills.wheel_turn import MOVED_RAD
+
+PUSH_N = 75.0  # of one finger on a spoke
+SIDE_N = 54.0  # of the hand on the rim; where the pads slip, the finger beside a spoke takes all of it, and is pressed past it
+SPARE_M = 0.001
+LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand
+SLACK_RAD = 0.03
+POOR_FRICTION = 0.3  # of pads on paint, with which the first grip across a wheel reckons
+SPARE_GRIP = 1.3
+FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
+ACROSS_SIDE_M, LEAST_ACROSS_M = 0.006, 0.002  # wanted and least free space on each side of a hand across the wheel
+GRIP_ACROSS_N = (20.0, 90.0)  # the force of one pad is taken by the other, so neither arm nor shaft feel it
+
+
+class Hold(StrEnum):
+    """How a hand holds a wheel."""
+
+    ACROSS = "across"
+    SPOKES = "spokes"
+    RIM = "rim"
+
+
+@dataclass(slots=True, kw_only=True)
+class Belief:
+    """What is believed of a wheel: its effort, by the panel file until it is felt, and which holds have failed.
+
+    Attributes:
+        effort_nm: torque that moves the wheel, or the largest that did not.
+        failed: holds that were tried in vain.
+        grip_n: force of the pads across the wheel; None until the first such hold.
+        tried_nm: largest torque that was put on the wheel.
+    """
+
+    effort_nm: float
+    failed: set[Hold] = field(default_factory=set)
+    grip_n: float | None = None
+    tried_nm: float = 0.0
+    _first_rad: float | None = None
+    _last: tuple[Hold, float, float] | None = None
+
+    def next_hold(self, wheel: Handwheel, hand: Hand) -> Hold | None:
+        """Return the hold to try: of those that have not failed, the first that takes the effort, or takes most of it."""
+        takes = {hold: nm for hold, nm in torques_nm(wheel, hand).items() if hold not in self.failed}
+        enough = [hold for hold, nm in takes.items() if nm > self.effort_nm]
+        return enough[0] if enough else max(takes, key=lambda hold: takes[hold], default=None)
+
+    def grip_across_n(self, wheel: Handwheel) -> float:
+        """Return the force of the pads across the wheel: for the believed effort at first, and the largest after a slip."""
+        if self.grip_n is None:
+            self.grip_n = float(
+                np.clip(SPARE_GRIP * self.effort_nm / (2.0 * POOR_FRICTION * outer_m(wheel)), *GRIP_ACROSS_N)
+            )
+        return self.grip_n
+
+    def begin(self, seen_rad: float) -> None:
+        """Note where the wheel stood before the first hold."""
+        if self._first_rad is None:
+            self._first_rad = seen_rad
+
+    def has_moved(self, seen_rad: float) -> bool:
+        """Return whether the wheel has turned since the first hold."""
+        return self._first_rad is not None and abs(seen_rad - self._first_rad) > MOVED_RAD
+
+    def felt(self, torque_nm: float) -> None:
+        """Note a torque that was put on the wheel."""
+        self.tried_nm = max(self.tried_nm, torque_nm)
+
+    def turned(self, hold: Hold, begun_rad: float, expected_rad: float) -> None:
+        """Note that a hold has turned the wheel, by what the fingers felt."""
+        self._last = (hold, begun_rad, expected_rad)
+
+    def learn(self, seen_rad: float) -> float:
+        """Compare what the last hold felt with what is seen; returns the turn that is missing, 0 if it is small.
+
+        A hold that slipped has failed; across the wheel only with the largest force of the pads.
+        """
+        if self._last is None:
+            return 0.0
+        (hold, begun_rad, expected_rad), self._last = self._last, None
+        felt_rad, moved_rad = abs(expected_rad - begun_rad), abs(seen_rad - begun_rad)
+        if moved_rad >= LEAST_SHARE * felt_rad - SLACK_RAD:
+            return 0.0
+        self.slipped(hold)
+        return felt_rad - moved_rad
+
+    def slipped(self, hold: Hold) -> None:
+        """Note that the pads slipped."""
+        if hold is Hold.ACROSS and (self.grip_n or 0.0) < 0.9 * GRIP_ACROSS_N[1]:
+            self.grip_n = GRIP_ACROSS_N[1]
+        else:
+            self.failed.add(hold)
+
+
+def torques_nm(wheel: Handwheel, hand: Hand) -> dict[Hold, float]:
+    """Return the torque that each possible hold of a wheel takes, the best hold first."""
+    takes: dict[Hold, float] = {}
+    if across_gap_m(wheel, hand) >= LEAST_ACROSS_M:
+        takes[Hold.ACROSS] = 2.0 * FRICTION * GRIP_ACROSS_N[1] * outer_m(wheel)
+    if holds := spoke_holds(wheel, hand, 0.0, 1.0):
+        takes[Hold.SPOKES] = 2.0 * PUSH_N * holds[0].arm_m
+    takes[Hold.RIM] = SIDE_N * wheel.radius_m
+    return takes
+
+
+def across_gap_m(wheel: Handwheel, hand: Hand) -> float:
+    """Return the free space between each finger and the rim of a hand that is open across the wheel; may be negative."""
+    return min(ACROSS_SIDE_M, 0.5 * (hand.max_width_m - SPARE_M) - outer_m(wheel))
+
+
+def outer_m(wheel: Handwheel) -> float:
+    """Return the radius of the wheel with its rim, m."""
+    return wheel.radius_m + wheel.rim_m

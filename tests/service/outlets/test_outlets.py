@@ -21,7 +21,9 @@ from hal.config import load_cell
 from hal.errors import ConfigError
 from hal.outlets import MqttSection, OutletsSection, PrometheusSection, WebhookSection
 from service.access.keys import Role
+from service.client import ApiError
 from service.commissioning.outlets import checked_outlets
+from service.outlets.api import ApiSource
 from service.outlets.process import outlets_of
 from service.outlets.prometheus import PrometheusOutlet
 from service.outlets.source import Cursor, CursorFile
@@ -204,6 +206,25 @@ def test_the_feed_tells_what_has_come_since_in_order(served: Panelwright, client
         client.get("/v1/feed?readings_after=999999&alarms_after=0").json()["readings_after"] == found["readings_after"]
     )
     plant.alarms.acknowledge("pump_lamp.state", by="cleaner")
+
+
+def test_an_outlet_knows_the_panel_and_acknowledges_what_the_service_allows(served: Panelwright) -> None:
+    plant = served.service.plant
+    lamp = {"object": "pump_lamp", "kind": "lamp", "unit": ""}
+    plant.alarms.take([reading(0, None, state="off", **lamp)])
+
+    async def story() -> None:
+        source = ApiSource(served.url)
+        assert {one.name: one.kind for one in await source.panel()}["pump_lamp"] == "lamp"
+        await source.acknowledge("pump_lamp.state", by="scada (OPC UA)", reason="on my way")
+        with pytest.raises(ApiError, match="cannot be acknowledged"):
+            await source.acknowledge("pump_lamp.state", by="scada (OPC UA)", reason="again")
+        await source.close()
+
+    asyncio.run(story())
+    alarm = plant.alarms.get("pump_lamp.state")
+    assert (alarm.state, alarm.by, alarm.reason) == ("acknowledged", "scada (OPC UA)", "on my way")
+    plant.alarms.take([reading(0, None, state="on", **lamp)])
 
 
 def test_the_gateway_is_a_process_of_its_own_that_is_started_again(write_cell: WriteCell, tmp_path: Path) -> None:

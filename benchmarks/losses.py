@@ -1,7 +1,9 @@
-"""Kills and suspends the processes of a cell: `python -m benchmarks.losses [--times 20] [--cell FILE]`.
+"""Kills, suspends and hangs the processes of a cell: `python -m benchmarks.losses [--times 20] [--cell FILE]`.
 
 Measures the time from the signal to the latched stop, which the control thread reads at its next tick, and the time until
-the cell is ready again. Prints a table and the pass line: each loss is noticed within 120 ms.
+the cell is ready again. A hung process sleeps in a call that holds the lock of Python, so that none of its threads goes on;
+one that computes holds the lock while it counts. Prints a table and the pass line: each loss is noticed within 120 ms. A
+process that computes is told apart from one that hangs, has a limit of its own, and is outside of the pass line.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +30,19 @@ from service.processes.supervisor import Supervisor
 ROOT = Path(__file__).resolve().parents[1]
 PASS_S = 0.12
 LONGEST_S = 60.0
-SIGNALS = {"killed": signal.SIGKILL, "suspended": signal.SIGSTOP}
+SIGNALS = {
+    "killed": signal.SIGKILL,
+    "suspended": signal.SIGSTOP,
+    "hung": signal.SIGUSR1,
+    "computing": signal.SIGUSR2,
+}
+OUTSIDE = "computing"
+HANGING = """
+import ctypes, signal
+library = ctypes.PyDLL(None)  # its calls keep the lock of Python
+signal.signal(signal.SIGUSR1, lambda *_: library.sleep(1000))
+signal.signal(signal.SIGUSR2, lambda *_: sum(range(10**12)))
+"""
 SERVICE = """
 import sys, threading
 from pathlib import Path
@@ -53,16 +68,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
+    parser.add_argument("--only", default="", help="one process or one way, such as `cell` or `hung`")
     given = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory(prefix="panelwright-losses-") as folder:
+        (Path(folder) / "sitecustomize.py").write_text(
+            HANGING, encoding="utf-8"
+        )  # every Python imports it at its start
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))
+        return _measure(given)
+
+
+def _measure(given: argparse.Namespace) -> int:
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     print("| lost | how | times | noticed ms, median | p99 | longest | ready again s, median | longest |")
     print(f"|{' --- |' * 8}", flush=True)
     latest_s = 0.0
     for name in ("cell", "stop", "service"):
         for how, number in SIGNALS.items():
+            if given.only not in ("", name, how):
+                continue
             losses = [one(name, number, given.cell) for _ in range(given.times)]
             noticed = np.array([loss.noticed_s for loss in losses])
             ready = [loss.ready_s for loss in losses]
-            latest_s = max(latest_s, float(np.quantile(noticed, 0.99)))
+            latest_s = max(latest_s, 0.0 if how == OUTSIDE else float(np.quantile(noticed, 0.99)))
             print(
                 f"| {name} | {how} | {len(losses)} | {1e3 * np.median(noticed):.0f} | {1e3 * np.quantile(noticed, 0.99):.0f} "
                 f"| {1e3 * noticed.max():.0f} | {np.median(ready):.1f} | {max(ready):.1f} |",

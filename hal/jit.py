@@ -18,14 +18,28 @@ from typing import Any, TypeVar, cast, overload
 
 import numba
 import numpy as np
+from numba.core import event
 from numba.extending import register_jitable
 
-from hal import kernel_cache
+from hal import kernel_cache, pauses
 
 kernel_cache.use(numba.config)
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T", bool, int)
+
+
+class _Compiling(event.Listener):
+    """Declares a pause while the compiler works, because it holds the lock of Python."""
+
+    def on_start(self, event: object) -> None:  # noqa: ARG002 - an interface
+        pauses.begin()
+
+    def on_end(self, event: object) -> None:  # noqa: ARG002 - an interface
+        pauses.end()
+
+
+event.register("numba:compiler_lock", _Compiling())  # type: ignore[no-untyped-call]  # numba has no types
 
 REORDERED = frozenset({"reassoc", "contract", "nsz", "arcp"})
 """For `fastmath`: the terms of a sum may be added in another order; NaN and infinity keep their meaning."""

@@ -1,9 +1,10 @@
-"""Says of another process of this machine whether it runs, is suspended or has ended."""
+"""Says of another process of this machine whether it runs, is suspended or has ended, and what its threads did."""
 
 from __future__ import annotations
 
 import os
 from contextlib import suppress
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -50,3 +51,40 @@ def set_memory_priority(score: int) -> None:
     """
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(f"{score}\n", encoding="ascii")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThreadTimes:
+    """What a thread has had of the machine since it began.
+
+    Attributes:
+        state: letter of the operating system: R runs or could run, D waits in the kernel (for a disk), S sleeps.
+        computed_s: time on a processor.
+        waited_s: time in which it could have run and no processor was free, up to its newest turn.
+    """
+
+    state: str
+    computed_s: float
+    waited_s: float
+
+
+def threads_of(pid: int) -> dict[int, ThreadTimes]:
+    """Return the threads of a process by id; empty where the operating system does not tell their times."""
+    try:
+        names = [int(task.name) for task in Path(f"/proc/{pid}/task").iterdir()]
+    except OSError:
+        return {}
+    threads = {name: thread_times(pid, name) for name in names}
+    return {name: times for name, times in threads.items() if times is not None}
+
+
+def thread_times(pid: int, thread: int) -> ThreadTimes | None:
+    """Return the times of one thread; None when it has ended, or where the operating system does not tell them."""
+    folder = Path(f"/proc/{pid}/task/{thread}")
+    try:
+        computed, waited, _ = (folder / "schedstat").read_text(encoding="ascii").split()
+        stat = (folder / "stat").read_text(encoding="utf-8", errors="replace")
+    except (OSError, ValueError):
+        return None
+    letter = stat.rpartition(")")[2].split()[0]
+    return ThreadTimes(state=letter, computed_s=1e-9 * int(computed), waited_s=1e-9 * int(waited))

@@ -13,11 +13,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hal.process_state import ProcessState, process_state
+from service.processes.hang import Hang
 
 PERIOD_S = 0.02
+BEGIN_S = 0.03  # of an older heartbeat the reader begins to watch what the process does
 LOOK_S = 0.06  # an older heartbeat makes the reader ask the operating system for the state of the process
-SILENCE_S = 4.0  # a process that runs may be this late: a compiler can hold the lock of Python for seconds
-SIZE = 16
+SILENCE_S = 4.0  # a process that has little of a busy machine may be this late
+PAUSE_S = 180.0  # a declared pause is no longer: one kernel compiles in a minute on a busy machine
+STILL_S = 0.04  # a silent process of which no thread moves for so long hangs
+COMPUTING_S = {"service": 1.0}  # a silent process may compute for so long: a large answer in JSON takes 0.2 s
+COMPUTING_OTHERS_S = 0.3
+SIZE = 24
 NAMES = ("service", "cell", "stop")
 
 
@@ -30,6 +36,8 @@ class Beat:
     """
 
     def __init__(self, folder: Path, name: str) -> None:
+        self._computing_s = COMPUTING_S.get(name, COMPUTING_OTHERS_S)
+        self._hang = Hang()
         path = folder / f"beat-{name}"
         if not path.exists():
             path.write_bytes(b"\0" * SIZE)
@@ -38,6 +46,15 @@ class Beat:
         # Views write a word at once; `struct.pack_into` clears its bytes first, so another process may read a zero.
         self._at_s = memoryview(self._memory)[:8].cast("d")
         self._pid = memoryview(self._memory)[8:16].cast("Q")
+        self._pause_ends_s = memoryview(self._memory)[16:24].cast("d")
+
+    def pause(self, begins: bool) -> None:
+        """Declare that this process gives no heartbeat for a while, or that it goes on; see `hal.pauses`."""
+        try:
+            self.beat()  # before the end of a pause, so that no reader takes the pause for silence
+            self._pause_ends_s[0] = time.monotonic() + PAUSE_S if begins else 0.0
+        except ValueError:
+            pass  # closed: this process ends
 
     def beat(self) -> None:
         """Write the current time."""
@@ -52,24 +69,40 @@ class Beat:
     def lost(self, *, silence_s: float) -> str | None:
         """Return how the process was lost, as in "has ended"; None while it lives, and before its first heartbeat.
 
-        A process that has ended or is suspended is noticed after 0.06 s, a process that runs and gives no heartbeat after
-        `silence_s`.
+        A process that has ended or is suspended is noticed after 0.06 s, and one that hangs after 0.1 s: none of its threads
+        runs, and none waits for a processor or a disk. A process that computes all the time and gives no heartbeat is lost
+        when it has computed for 0.3 s (the service: 1 s), and any silent process after `silence_s`, unless it has declared a
+        pause. Call it periodically, because a hang shows only between two calls.
         """
         try:
+            is_paused = time.monotonic() < float(
+                self._pause_ends_s[0]
+            )  # read before the heartbeat, which a pause renews
             age_s, pid = self.age_s(), int(self._pid[0])
         except ValueError:
             return None  # closed: this process ends
-        if pid == 0 or age_s < LOOK_S:
+        if pid == 0 or age_s < BEGIN_S:
+            self._hang.forget()
+            return None
+        still_s, computed_s = (0.0, 0.0) if is_paused else self._hang.look(pid)
+        if age_s < LOOK_S:
             return None
         state = process_state(pid)
         if state is not ProcessState.RUNS:
             return str(state)
-        return f"gave no sign of life for {age_s:.1f} s" if age_s > silence_s else None
+        if is_paused:
+            return None
+        if still_s >= STILL_S:
+            return f"hangs: none of its threads has run for {age_s:.2f} s"
+        if computed_s >= self._computing_s or age_s > silence_s:
+            return f"gave no sign of life for {age_s:.1f} s"
+        return None
 
     def close(self) -> None:
         """Unmap the file; a second call does nothing."""
         self._at_s.release()
         self._pid.release()
+        self._pause_ends_s.release()
         self._memory.close()
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hal import pauses
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
 from service.processes.beat import SILENCE_S, Beat, every_beat
@@ -95,6 +96,7 @@ class Supervisor:
         self.latch = Latch.create(self.folder / LATCH)
         self._own_beat, self._cell_beat = Beat(self.folder, "service"), Beat(self.folder, "cell")
         self._own_beat.beat()
+        self._end_of_pauses = pauses.tell(self._own_beat.pause)
         self._stop: StopHost = (
             InlineStop(self.latch, stop_listener, origins)
             if inline
@@ -226,6 +228,7 @@ class Supervisor:
             self._early.close()
         self._remote.close()
         self._watching.set()
+        self._end_of_pauses()
         self._stop.close()
         self.latch.close()
         self._runtime.close()

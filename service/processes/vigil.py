@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from hal import pauses
 from service.processes.beat import PERIOD_S, Beat
 from service.processes.cell_lines import LOST, note_to_line
 from service.processes.child import Lifeline, kill_own_group
@@ -25,6 +26,7 @@ class Vigil:
         self._lifeline = lifeline
         self._own, self._stop = Beat(folder, "cell"), Beat(folder, "stop")
         self._silence_s = silence_s
+        pauses.tell(self._own.pause)
         self._lost: Callable[[], str | None] = lambda: None
         self.is_alone = False
 

@@ -10,17 +10,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from numba.core.compiler_lock import global_compiler_lock
 
+import hal.jit  # noqa: F401 - the compiler of this project declares its pauses
+from hal import pauses
 from hal.process_state import ProcessState, process_state
 from service.processes.beat import LOOK_S, Beat
 from service.processes.latch import Latch
 from service.processes.stop import Watchdog
 from tests.service.waiting import eventually
 
-BEATS = (
-    "import sys, pathlib; from service.processes.beat import Beat\n"
-    "b = Beat(pathlib.Path(sys.argv[1]), 'cell')\nwhile True: b.beat()"
-)
+BEATS = """
+import ctypes, pathlib, signal, sys
+from service.processes.beat import Beat
+
+signal.signal(signal.SIGUSR1, lambda *_: ctypes.PyDLL(None).sleep(600))  # its calls keep the lock of Python
+signal.signal(signal.SIGUSR2, lambda *_: sum(range(10**12)))
+beat = Beat(pathlib.Path(sys.argv[1]), "cell")
+while True:
+    beat.beat()
+"""
 
 
 @pytest.fixture
@@ -48,6 +57,47 @@ def test_a_suspended_process_is_lost_until_it_goes_on(other: tuple[Beat, int]) -
     assert eventually(lambda: beat.lost(silence_s=600.0)) == ProcessState.SUSPENDED
     os.kill(pid, signal.SIGCONT)
     eventually(lambda: beat.lost(silence_s=600.0) is None)
+
+
+def test_a_process_whose_threads_all_wait_for_one_that_sleeps_is_lost_long_before_its_time(
+    other: tuple[Beat, int],
+) -> None:
+    beat, pid = other
+    os.kill(pid, signal.SIGUSR1)
+    assert "hangs" in str(eventually(lambda: beat.lost(silence_s=600.0)))
+
+
+def test_a_process_that_computes_and_never_gives_a_heartbeat_is_lost(other: tuple[Beat, int]) -> None:
+    beat, pid = other
+    os.kill(pid, signal.SIGUSR2)
+    assert "no sign of life" in str(eventually(lambda: beat.lost(silence_s=600.0), timeout_s=60.0))
+
+
+def test_a_declared_pause_is_no_loss_and_its_end_is_a_heartbeat(tmp_path: Path) -> None:
+    beat = Beat(tmp_path, "cell")
+    beat.pause(True)
+    eventually(lambda: beat.age_s() > LOOK_S)
+    assert beat.lost(silence_s=0.0) is None
+    late_s = beat.age_s()
+    beat.pause(False)
+    assert beat.age_s() < late_s
+    assert "no sign of life" in str(eventually(lambda: beat.lost(silence_s=0.0)))
+    beat.close()
+    beat.pause(True)  # does nothing
+
+
+def test_the_compiler_declares_its_pauses_and_nested_ones_count_as_one() -> None:
+    told: list[bool] = []
+    end = pauses.tell(told.append)
+    with global_compiler_lock, global_compiler_lock:
+        assert told == [True]
+    assert told == [True, False]
+    with pauses.declared(), pauses.declared():
+        assert told == [True, False, True]
+    assert told == [True, False, True, False]
+    end()
+    with pauses.declared():
+        assert len(told) == 4
 
 
 def test_a_killed_process_is_lost_although_its_parent_has_not_asked_for_it(other: tuple[Beat, int]) -> None:

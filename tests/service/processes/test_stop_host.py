@@ -40,6 +40,14 @@ def test_a_stop_process_that_hangs_keeps_nobody_from_stopping(latch: Latch, host
     assert latch.is_set()
 
 
+def test_the_death_of_the_stop_process_latches_the_stop_even_if_nobody_watches_its_heartbeat(
+    latch: Latch, host: ProcessStop
+) -> None:
+    os.kill(_pid(host), signal.SIGKILL)
+    eventually(lambda: host.restarts == 1 and host.is_alive())
+    assert latch.state().source == "the stop process died"
+
+
 def test_a_reset_that_the_stop_process_overtook_by_a_stop_is_not_done(
     latch: Latch, host: ProcessStop, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,82 @@
+"""Tells a silent process that hangs from one that computes and from one for which the machine has no time.
+
+This module imports little, because the stop process must start fast and stay small.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from hal.process_state import ThreadTimes, thread_times, threads_of
+
+STEP_S = 0.015  # looks that follow closer add nothing
+LONGEST_STEP_S = 0.04  # of a longer gap between two looks only this counts: the observer itself was kept waiting
+BUSY_SHARE = 0.5
+AGAIN_S = 0.0005  # a thread that only waits for the lock of Python wakes for a shorter time
+WAITING = "D"
+RUNNABLE = "R"
+
+
+class Hang:
+    """Adds up what a silent process does, from one look to the next; several threads may look.
+
+    A thread that sleeps while it holds the lock of Python, or all threads that wait for each other, compute nothing and wait
+    for no processor. A process that the machine is too busy for has a thread that could run and gets no processor.
+
+    Args:
+        threads: returns the threads of a process by id.
+        thread: returns one of them, or None when it has ended.
+        now_s: a monotonic clock.
+    """
+
+    def __init__(
+        self,
+        threads: Callable[[int], dict[int, ThreadTimes]] = threads_of,
+        thread: Callable[[int, int], ThreadTimes | None] = thread_times,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._threads, self._thread, self._now_s = threads, thread, now_s
+        self._lock = threading.Lock()
+        self._pid = 0
+        self._before: dict[int, ThreadTimes] = {}
+        self._looked_s = self._still_s = self._computed_s = 0.0
+
+    def forget(self) -> None:
+        """Begin again, because the process has given a heartbeat."""
+        self._pid = 0
+
+    def look(self, pid: int) -> tuple[float, float]:
+        """Return for how long, in seconds since the first look, the process stood still and for how long it computed."""
+        with self._lock:
+            now_s = self._now_s()
+            if pid != self._pid:
+                self._pid, self._looked_s, self._still_s, self._computed_s = pid, now_s, 0.0, 0.0
+                self._before = self._threads(pid)
+            elif now_s - self._looked_s >= STEP_S:
+                self._add(pid, min(now_s - self._looked_s, LONGEST_STEP_S))
+                self._looked_s = now_s
+            return self._still_s, self._computed_s
+
+    def _add(self, pid: int, step_s: float) -> None:
+        before, now = self._before, self._threads(pid)
+        self._before = now
+        both = [(before[name], now[name]) for name in now if name in before]
+        if not both:  # the operating system does not tell
+            return
+        computed_s = sum(after.computed_s - first.computed_s for first, after in both)
+        waited_s = sum(after.waited_s - first.waited_s for first, after in both)
+        self._computed_s += min(computed_s, step_s)
+        is_busy = max(computed_s, waited_s) > BUSY_SHARE * step_s or len(both) < len(now)
+        if not is_busy and not any(times.state == WAITING for times in now.values()) and not self._could_run(pid, now):
+            self._still_s += step_s
+
+    def _could_run(self, pid: int, now: dict[int, ThreadTimes]) -> bool:
+        """Return whether a thread runs, or waits for a processor, both now and a moment later."""
+        runnable = [name for name, times in now.items() if times.state == RUNNABLE]
+        if not runnable:
+            return False
+        threading.Event().wait(AGAIN_S)
+        later = [self._thread(pid, name) for name in runnable]
+        return any(times is not None and times.state == RUNNABLE for times in later)

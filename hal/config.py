@@ -109,6 +109,9 @@ class BoxSection(Strict):
         return self
 
 
+LossAction = Literal["hold", "retreat", "stop"]
+
+
 class SafetySection(Strict):
     """`[safety]`"""
 
@@ -116,11 +119,17 @@ class SafetySection(Strict):
     speed_limit_m_per_s: Annotated[float, Field(gt=0, le=2)] = 0.25
     lease_ttl_s: Annotated[float, Field(ge=0.1, le=10)] = 2.0
     client_lost: Annotated[
-        Literal["hold", "stop"],
+        LossAction,
         Field(
-            description="what happens when the lease lapses in a motion: `hold` ends the motion and holds the arm, `stop` also "
-            "latches the stop and switches the drives off"
+            description="what happens when the lease lapses in a motion: `hold` ends the motion and holds the arm, `retreat` then "
+            "goes back the way it came (0.1 m at most), `stop` latches the stop and switches the drives off"
         ),
+    ] = "hold"
+    device_lost: Annotated[
+        LossAction, Field(description="the same for a device that fails in a motion; the arm itself always stops")
+    ] = "hold"
+    wrench_lost: Annotated[
+        LossAction, Field(description="the same for a force/torque sensor that is silent or impossible in a motion")
     ] = "hold"
     max_reading_age_s: Positive = 0.1
     joint_limits_rad: Annotated[

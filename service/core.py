@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -36,6 +36,7 @@ from service.tasks.gate import GatedConnection
 from service.tasks.journal import Journal
 from service.tasks.journal_watch import JournalWatch
 from service.tasks.lease import Command, LeaseDesk
+from service.tasks.losses import Losses
 from service.tasks.model import Task, TaskState
 from service.tasks.store import TaskContext, TaskStore
 from service.tasks.sub_leases import SubLease
@@ -100,6 +101,7 @@ class Service:
             record=None if self.recording is None else self.recording.endpoint,
             replay=replay,
         )
+        self.losses = Losses(cell, stop=self.stop_quietly)
         self.journal_watch = JournalWatch(self.journal, self._on_no_record)
         recorder = self.journal if self.recording is None else self.recording.recorder(self.journal)
         self.tasks = TaskStore(state_dir / "tasks", recorder=recorder, stop_motion=self._stop_motion)
@@ -209,7 +211,8 @@ class Service:
 
             self.lease.check_in_time(command)  # again, because it may have waited in the queue
             cell, stop = self.calibrations.applied(), self.supervisor.stop
-            connection = GatedConnection(self.supervisor.connection, check_may_move, cell=cell, stop=stop)
+            after = self.losses.followed(task.id, lambda: self._check_not_stopped_since(stops_seen))
+            connection = GatedConnection(self.supervisor.connection, check_may_move, cell=cell, stop=stop, after=after)
             observer = observe(task=task.id, cell_now_s=connection.clock.now_s)
             context = OperationContext(
                 connection=connection, task=task, runs_dir=self.runs_dir, world=self.world, observer=observer
@@ -318,15 +321,15 @@ class Service:
             )
 
     def _stop_motion(self) -> None:
-        if self.supervisor.is_ready:
-            self.supervisor.connection.mover.cancel()
+        with self.losses.cancelling() as may_end:
+            if may_end and self.supervisor.is_ready:
+                self.supervisor.connection.mover.cancel()
 
     def _on_client_lost(self, task: Task, why: str) -> None:
         """End the motion of a client that is lost, in the way that the cell file chooses."""
         is_moving = task.state is TaskState.RUNNING
-        self.tasks.cancel(task.id, reason=why)
-        if is_moving and self.cell.file.safety.client_lost == "stop":
-            self.stop_quietly(why)
+        with self.losses.of_client(task.id, why) if is_moving else nullcontext():
+            self.tasks.cancel(task.id, reason=why)
 
     def _on_no_record(self, why: str) -> None:
         """Latch the stop, because nothing may move without a record."""

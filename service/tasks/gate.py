@@ -26,12 +26,14 @@ class GatedMover:
         check: raises when the task may not move any more.
         arms: names of devices whose failure stops the cell.
         stop: latches the stop; takes the reason.
+        after: called with the report of each motion and the mover behind the gate; see `Losses`.
     """
 
     mover: Mover
     check: Callable[[], None]
     arms: Collection[str] = ()
     stop: Callable[[str], object] = lambda _reason: None
+    after: Callable[[MotionReport, Mover], object] = lambda _report, _mover: None
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
         """Run the motion.
@@ -43,6 +45,7 @@ class GatedMover:
         report = self.mover.execute(motion)
         if report.device in self.arms:
             self.stop(report.cause)
+        self.after(report, self.mover)
         return report
 
     def cancel(self) -> None:
@@ -74,11 +77,13 @@ class GatedConnection:
         *,
         cell: Cell | None = None,
         stop: Callable[[str], object] = lambda _reason: None,
+        after: Callable[[MotionReport, Mover], object] = lambda _report, _mover: None,
     ) -> None:
         self._connection = connection
         self._check = check
         self._cell = cell
         self._stop = stop
+        self._after = after
 
     @property
     def cell(self) -> Cell:
@@ -98,6 +103,7 @@ class GatedConnection:
             check=self._check,
             arms=self.cell.names_of(DeviceKind.ARM),
             stop=self._stop,
+            after=self._after,
         )
 
     def device(self, name: str) -> Any:

@@ -1,0 +1,149 @@
+"""What happens when a motion loses its client or a device: hold, go back the way it came, or stop and switch off.
+
+The cell file chooses (`[safety]`: `client_lost`, `device_lost`, `wrench_lost`). The loss of the arm itself, of the service, the
+cell or the stop process always stops and switches off: nothing is left that could move the arm with care.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from hal.arrays import Array
+from hal.config import Cell, LossAction
+from hal.devices import DeviceKind
+from hal.errors import CellError
+from hal.motion import JointTrajectory, MotionOutcome, MotionReport, Mover
+
+BACK_M = 0.10  # of the tip; further away nothing is touched any more
+BACK_M_PER_S = 0.05
+BACK_RAD_PER_S = 0.3
+THIN_RAD = 0.01  # between two points of the way back
+TRAIL_MOTIONS = 20
+log = logging.getLogger(__name__)
+
+
+class Losses:
+    """Carries out what the cell file chooses for each loss.
+
+    Args:
+        cell: with the choices, and with the names of the arms and force/torque sensors.
+        stop: latches the stop, which also switches the drives off; takes the reason.
+    """
+
+    def __init__(self, cell: Cell, *, stop: Callable[[str], object]) -> None:
+        self._safety = cell.file.safety
+        self._arms: Collection[str] = cell.names_of(DeviceKind.ARM)
+        self._wrists: Collection[str] = cell.names_of(DeviceKind.FORCE_TORQUE)
+        self._stop = stop
+        self._lock = threading.Lock()
+        self._is_going_back = False
+        self._without_client: deque[str] = deque(maxlen=100)
+
+    @contextmanager
+    def of_client(self, task: str, why: str) -> Iterator[None]:
+        """Cancel a running motion task in this context when it has lost its client."""
+        self._without_client.append(task)
+        yield
+        if self._safety.client_lost == "stop":
+            self._stop(why)
+
+    def followed(self, task: str, check: Callable[[], None]) -> Callable[[MotionReport, Mover], None]:
+        """Return what must be called with the report of each motion of a task, and with the mover.
+
+        Args:
+            check: raises when the stop was pressed after the task was asked for, even if it was reset since.
+        """
+        trail = Trail()
+
+        def after(report: MotionReport, mover: Mover) -> None:
+            trail.add(report)
+            if self._action(task, report) == "retreat" and (motion := trail.way_back()) is not None:
+                self._go_back(motion, mover, check)
+
+        return after
+
+    @contextmanager
+    def cancelling(self) -> Iterator[bool]:
+        """Give whether a cancellation may end the running motion: a way back is ended by the stop only."""
+        with self._lock:
+            yield not self._is_going_back
+
+    def _action(self, task: str, report: MotionReport) -> LossAction:
+        if report.outcome is MotionOutcome.CANCELLED and task in self._without_client:
+            return self._safety.client_lost
+        if report.outcome is MotionOutcome.FAULT and report.device is not None and report.device not in self._arms:
+            action = self._safety.wrench_lost if report.device in self._wrists else self._safety.device_lost
+            if action == "stop":
+                self._stop(report.cause)
+            return action
+        return "hold"
+
+    def _go_back(self, motion: JointTrajectory, mover: Mover, check: Callable[[], None]) -> None:
+        with self._lock:
+            self._is_going_back = True
+        try:
+            check()
+            report = mover.execute(motion)
+            log.warning("went back the way the arm had come: %s", report.cause)
+        except CellError as error:  # above all the stop
+            log.warning("the arm does not go back the way it came: %s", error)
+        finally:
+            with self._lock:
+                self._is_going_back = False
+
+
+class Trail:
+    """The way of the arm in the motions of a task, the newest last."""
+
+    def __init__(self) -> None:
+        self._logs: deque[tuple[Array, Array]] = deque(maxlen=TRAIL_MOTIONS)
+        self._here_rad: Array | None = None
+
+    def add(self, report: MotionReport) -> None:
+        """Note the way of a motion."""
+        self._logs.append((report.log.positions_rad, report.log.tip_m))
+        self._here_rad = report.position_rad
+
+    def way_back(self) -> JointTrajectory | None:
+        """Return a slow motion back along the trail, at most `BACK_M` of the tip; None when the arm has not moved.
+
+        It needs the arm only, and the force limit of a transfer ends it.
+        """
+        path, times_s = [np.asarray(self._here_rad, float)], [0.0]
+        gone_m = 0.0
+        last_m: Array | None = None
+        for positions_rad, tips_m in reversed(self._logs):
+            for q, tip_m in zip(positions_rad[::-1], tips_m[::-1], strict=True):
+                far_rad = float(np.abs(q - path[-1]).max())
+                if last_m is None:
+                    last_m = tip_m
+                if far_rad < THIN_RAD:
+                    continue
+                step_m = float(np.linalg.norm(tip_m - last_m))
+                gone_m, last_m = gone_m + step_m, tip_m
+                if gone_m > BACK_M:
+                    return _slowly(path, times_s)
+                path.append(np.asarray(q, float))
+                times_s.append(times_s[-1] + max(step_m / BACK_M_PER_S, far_rad / BACK_RAD_PER_S))
+        return _slowly(path, times_s)
+
+
+def _slowly(path: list[Array], times_s: list[float]) -> JointTrajectory | None:
+    if len(path) < 2:
+        return None
+    positions, times = np.array(path), np.array(times_s)
+    velocities = np.zeros_like(positions)
+    velocities[1:-1] = (positions[2:] - positions[:-2]) / (times[2:] - times[:-2])[:, None]
+    return JointTrajectory(
+        name="back the way it came",
+        times_s=times,
+        positions_rad=positions,
+        velocities_rad_per_s=velocities,
+        is_retreat=True,
+    )

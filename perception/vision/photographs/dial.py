@@ -116,8 +116,8 @@ def _on_full_turn(fit: PointerFit, *, minimum: float, maximum: float) -> PatchRe
 
 def _which_is_meant(seen: tuple[SeenPointer, ...]) -> str:
     """Return the reason for a refusal if there are several pointers and none is asked for."""
-    told = " and ".join(f"a {p.colour} one, {100 * p.length:.0f} % of the radius long, at {p.value:.4g}" for p in seen)
-    return f"there are two pointers, {told or 'a black one and a red one'}: say which is meant, pointer black or red"
+    told = " and ".join(f"a {p.colour} one ({p.length:.2f} of the radius long) at {p.value:.4g}" for p in seen)
+    return f"there are two pointers: {told or 'a black one and a red one'}. Say which one is meant, black or red"
 
 
 def _at_reading_size(image: NDArray[Any]) -> tuple[Image, tuple[float, float, float]]:

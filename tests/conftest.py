@@ -6,9 +6,9 @@ import pytest
 from hypothesis import settings
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, print_blob=True)
-settings.register_profile(
-    "long", deadline=None, print_blob=True
-)  # for the figures; see tests/service/http/test_life_cycle.py
+settings.register_profile(  # for the figures: 100 000 steps of each model; see tests/service/http/test_life_cycle.py
+    "long", deadline=None, print_blob=True, max_examples=2000, stateful_step_count=50
+)
 settings.register_profile("seeded", deadline=None, print_blob=True, max_examples=50)  # for benchmarks.faults
 settings.load_profile("repeatable")
 

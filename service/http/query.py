@@ -13,7 +13,7 @@ from service.http.problems import path_of
 NEVER_REFUSED = ("/v1/stop",)  # a stop works with any parameters
 
 
-def check_query(connection: HTTPConnection) -> None:
+async def check_query(connection: HTTPConnection) -> None:
     """Check the query parameters of a request; a dependency of every route.
 
     Raises:

@@ -104,7 +104,7 @@ def _in_this_context(work: Callable[[], T]) -> Callable[[], T]:
     return lambda: context.run(work)
 
 
-def state_of(request: Request) -> AppState:
+async def state_of(request: Request) -> AppState:
     """Return the application's state, for routes."""
     state: AppState = request.app.state.panelwright
     return state

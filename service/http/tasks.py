@@ -56,7 +56,7 @@ def _followed(state: AppState, task: Task) -> AbstractContextManager[None]:
     return state.service.lease.subs.kept(task.sub_lease if task.by == actor() else None)
 
 
-def _watched(state: State, task_id: TaskId) -> Task:
+async def _watched(state: State, task_id: TaskId) -> Task:
     """Return the task, looked up before the stream begins, so that an unknown id is a 404 and not an empty stream."""
     return state.service.tasks.get(task_id)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from benchmarks.faults import table
+from benchmarks.faults import passed, table
 from service.chaos.faults import FAULTS
 
 ROOT = Path(__file__).parents[2]
@@ -26,3 +26,13 @@ def test_every_fault_of_chaos_belongs_to_one_of_the_table() -> None:
     named = {fault for row in table().values() for fault in row.get("chaos", [])}
     assert named <= known
     assert known - named == {"kill stop", "hang cell", "hang world", "hang stop"}, "these are losses: benchmarks.losses"
+
+
+def test_a_test_counts_as_passed_when_all_its_parameters_passed_and_none_was_skipped() -> None:
+    report = """<testsuites><testsuite>
+      <testcase classname="tests.a" name="test_one"/>
+      <testcase classname="tests.a" name="test_two[x]"/>
+      <testcase classname="tests.a" name="test_two[y]"><failure message="no"/></testcase>
+      <testcase classname="tests.a" name="test_three"><skipped message="why"/></testcase>
+    </testsuite></testsuites>"""
+    assert passed(report) == {"tests/a.py::test_one"}

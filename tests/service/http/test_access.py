@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,6 +98,32 @@ def test_every_call_has_a_row_and_every_row_a_call(write_cell: WriteCell, tmp_pa
         assert calls_of(guard.inner.routes) == set(TABLE), (
             "add the call to service/http/permissions.py, or take its row out"
         )
+    finally:
+        service.close()
+
+
+def dependencies_of(routes: Iterable[BaseRoute]) -> set[Callable[..., Any]]:
+    """Return everything that runs before the calls of routes."""
+    found: set[Callable[..., Any]] = set()
+    for route in routes:
+        inner = getattr(route, "original_router", None)
+        waiting = [] if not isinstance(route, APIRoute) else list(route.dependant.dependencies)
+        waiting += [] if inner is None else [one for each in inner.routes for one in each.dependant.dependencies]
+        while waiting:
+            one = waiting.pop()
+            found |= {one.call}
+            waiting += one.dependencies
+    return found
+
+
+def test_no_request_waits_for_a_free_thread_before_its_call(write_cell: WriteCell, tmp_path: Path) -> None:
+    service = Service(load_cell(write_cell(robot=True)), OPERATIONS, runs_dir=tmp_path / "runs", inline=True)
+    try:
+        guard = create_app(service, allowed=Allowed(hosts=frozenset(), origins=frozenset()), stop_url="")
+        assert isinstance(guard, RequestGuard)
+        calls = dependencies_of(guard.inner.routes)
+        assert len(calls) > 5
+        assert {call.__name__ for call in calls if not inspect.iscoroutinefunction(call)} == set()
     finally:
         service.close()
 

@@ -1,6 +1,6 @@
 """Stops, resets, leases and tasks in any order, over HTTP, against a model of a dozen lines.
 
-`python -m pytest -n 0 tests/service/http/test_life_cycle.py --hypothesis-profile=long` makes 100 000 steps.
+`python -m pytest -n 0 tests/service/http/test_life_cycle.py --timeout 0 --hypothesis-profile=long` makes 100 000 steps.
 """
 
 from __future__ import annotations

@@ -9,10 +9,10 @@ returns 1 if one is missed. `--only latency,crowd,paint,axe,clicks,kills` choose
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,6 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("/", "/missions", "/rounds", "/alarms", "/review", "/history", "/devices", "/setup", "/cell")
 SIZES, SCHEMES = ((1440, 900), (390, 844)), ("light", "dark")
 BROWSERS = 10
+LONGEST_S = 5.0
 SEEN = """(name) => { window.seenMs = null;
   const row = () => document.querySelector(`g[data-object=${name}]`)?.dataset.row;
   const before = row();
@@ -130,7 +131,9 @@ def crowd(service: Served, browser: Browser, given: argparse.Namespace) -> Itera
         page.context.close()
     yield Line(what="mission beside ten browsers", measured=outcome, wanted="succeeded", is_met=outcome == "succeeded")
     yield _at_most("event-loop lag beside ten browsers and a mission, p99", 1e3 * lag_s, 10, "ms")
-    yield _at_most(f"stop beside ten browsers, p99 of {given.stops}", 1e3 * float(np.quantile(stops_s, 0.99)), 10, "ms")
+    yield _at_most(
+        f"stop to latch beside ten browsers, p99 of {given.stops}", 1e3 * float(np.quantile(stops_s, 0.99)), 10, "ms"
+    )
 
 
 def paint(service: Served, browser: Browser, given: argparse.Namespace) -> Iterator[Line]:
@@ -206,17 +209,18 @@ def _at_most(what: str, value: float, most: float, unit: str) -> Line:
 
 
 def _stop(service: Served) -> float:
-    """Return how long a stop takes until it is answered, and reset it."""
-    import http.client
-
+    """Return the time from a stop to the set latch, s, which the control thread reads at its next tick; reset it."""
     host, port = re.findall(r"//([^:/]+):(\d+)", service.stop_url)[0]
-    link = http.client.HTTPConnection(host, int(port))
-    link.connect()
-    begun_s = time.perf_counter()
-    link.request("POST", "/v1/stop")
-    state = json.loads(link.getresponse().read())
-    taken_s = time.perf_counter() - begun_s
-    link.close()
+    with socket.create_connection((host, int(port))) as link:
+        begun_s = time.perf_counter()
+        link.sendall(b"POST /v1/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        while not service.latch.is_set():
+            if time.perf_counter() - begun_s > LONGEST_S:
+                raise TimeoutError("the stop was not latched")
+        taken_s = time.perf_counter() - begun_s
+        while link.recv(4096):  # the answer comes when the stop is recorded
+            pass
+    state = service.client.get("/v1/stop")
     service.client.post("/v1/stop/reset", {"seen_count": state["count"]})
     return taken_s
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from typing import Any
 from playwright.sync_api import Browser, Error, Page
 
 from service.client import Client
+from service.processes.latch import LATCH, Latch
 
 ROOT = Path(__file__).resolve().parents[1]
 PATIENCE_MS = 150_000
@@ -33,6 +35,7 @@ class Served:
     console_url: str
     runs: Path
     client: Client
+    latch: Latch
 
     def console_pid(self) -> int | None:
         """Return the id of the console's process; None while there is none."""
@@ -98,9 +101,11 @@ def served(cell: Path, *, runs: Path | None = None) -> Iterator[Served]:
         runs = Path(folder) / "runs" if runs is None else runs
         command = [sys.executable, "-m", "service.cli", "serve", "--cell", str(own), "--port", "0", "--runs", str(runs)]
         command += ["--console-port", "0"]
-        with subprocess.Popen(
-            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        ) as process:
+        temporary = Path(folder) / "t"  # where the service keeps its latch
+        temporary.mkdir()
+        environment = {**os.environ, "TMPDIR": str(temporary)}
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as process:
             assert process.stdout is not None
             told = ""
             while "console at" not in told:
@@ -113,8 +118,12 @@ def served(cell: Path, *, runs: Path | None = None) -> Iterator[Served]:
                 _found(pattern, told) for pattern in (r"ready at (\S+)", r"POST (\S+)", r"console at (\S+)")
             )
             client = Client(url=url, timeout_s=120.0)
+            (latched,) = temporary.glob(f"panelwright-*/{LATCH}")
             try:
-                yield Served(url=url, stop_url=stop_url, console_url=console_url, runs=runs, client=client)
+                with Latch(latched) as latch:
+                    yield Served(
+                        url=url, stop_url=stop_url, console_url=console_url, runs=runs, client=client, latch=latch
+                    )
             finally:
                 process.terminate()
                 process.wait(60.0)

@@ -10,12 +10,17 @@ import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from asyncua import Client, Node, ua
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.x509.oid import NameOID
 
 from hal.errors import ConfigError
 from hal.outlets import OpcuaSection, OutletsSection
@@ -232,6 +237,56 @@ def test_clients_may_only_look() -> None:
                         pass
 
     asyncio.run(story())
+
+
+def test_with_a_certificate_only_encrypted_connections_are_taken(tmp_path: Path) -> None:
+    cert, key = rsa_certificate(tmp_path)
+
+    async def story() -> None:
+        source = FakeSource()
+        source.reads(4.5)
+        async with serving(source, certificate_file=str(cert), private_key_file=str(key), **USER) as url:
+            plain = Client(url)
+            plain.set_user("scada")
+            plain.set_password("s3cret")
+            with pytest.raises((ua.UaError, OSError)):
+                async with plain:
+                    pass
+            client = Client(url)
+            client.application_uri = NAMESPACE.format(cell="bench")
+            client.set_user("scada")
+            client.set_password("s3cret")
+            await client.set_security(SecurityPolicyBasic256Sha256, str(cert), str(key), server_certificate=str(cert))
+            async with client:
+                await until(client, "pressure.value", is_status(ua.StatusCodes.Good))
+
+    asyncio.run(story())
+
+
+def rsa_certificate(folder: Path) -> tuple[Path, Path]:
+    """Write a certificate with the server's application URI, and its key."""
+    key, name = (
+        rsa.generate_private_key(public_exponent=65537, key_size=2048),
+        x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "bench")]),
+    )
+    now = datetime.now(UTC)
+    uri = x509.UniformResourceIdentifier(NAMESPACE.format(cell="bench"))
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(1)
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([uri]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    (folder / "cert.pem").write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    (folder / "key.pem").write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    return folder / "cert.pem", folder / "key.pem"
 
 
 def test_units_have_the_numbers_that_unece_gives_them() -> None:

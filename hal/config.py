@@ -85,6 +85,12 @@ class SimulationSection(Strict):
         str | None,
         Field(description="panel file of the panel as built; if null, the panel is as `cell.panel` states it"),
     ] = None
+    shows: Annotated[
+        dict[Name, float],
+        Field(
+            description="what instruments and lamps show at first, in place of what the seed draws; a lamp is lit from 0.5 on"
+        ),
+    ] = {}
     pad_friction: Annotated[float, Field(ge=0.05, le=2.0, description="coefficient of friction of the finger pads")] = (
         0.8
     )
@@ -218,6 +224,8 @@ class CellFile(Strict):
             raise ValueError("emulators need cell.mode = 'mixed' or 'sim'")
         if self.simulation.cables and self.cell.mode == "real":
             raise ValueError("simulation.cables need cell.mode = 'mixed' or 'sim'")
+        if self.simulation.shows and self.cell.mode == "real":
+            raise ValueError("simulation.shows needs cell.mode = 'mixed' or 'sim'")
         if self.simulation.built_panel is not None and self.cell.mode == "real":
             raise ValueError("simulation.built_panel needs cell.mode = 'mixed' or 'sim'")
         return self

@@ -108,6 +108,7 @@ class WorldClient:
                 key="cell.mode",
             )
         _check_park(cell)
+        _check_shows(cell)
         names = [name for name, driver, _ in _sim_devices(cell) if driver == "sim:proximity"]
         if len(names) > MAX_PROXIMITY:
             raise ConfigError(f"a simulated cell has at most {MAX_PROXIMITY} proximity sensors", hint="remove some")
@@ -260,13 +261,12 @@ class WorldClient:
 
     def show(self, name: str, value: float) -> None:
         """Let an instrument or lamp show another value from now on; see `hal.simulated.ShowsValues`."""
-        built = self.cell.built_panel or self.cell.panel
-        index = next((k for k, one in enumerate(built.objects) if one.name == name), None)
-        if index is None or not is_shown(built.objects[index]):
+        if name not in _shown_names(self.cell):
             raise InvalidRequest(
-                f"{name} cannot be made to show a value", hint="name a gauge, meter, display or lamp of the panel"
+                f"{name} cannot be made to show a value", hint=f"name one of {', '.join(_shown_names(self.cell))}"
             )
-        self.ask(Op.SHOW, index, value)
+        names = [one.name for one in self.cell.panel.objects]
+        self.ask(Op.SHOW, names.index(name), value)
 
     def ask(self, op: Op, *arguments: float) -> object:
         """Send any other request to the world, and return its answer."""
@@ -301,6 +301,23 @@ def _sim_devices(cell: Cell) -> list[tuple[str, str, dict[str, object]]]:
     direct = [(name, device.driver, device.options) for name, device in cell.file.devices.items()]
     behind = [(name, emulator.driver, emulator.options) for name, emulator in cell.file.emulators.items()]
     return [entry for entry in direct + behind if entry[1].startswith("sim:")]
+
+
+def _shown_names(cell: Cell) -> list[str]:
+    """Return the objects that can be made to show a value."""
+    return [one.name for one in cell.panel.objects if is_shown(one)]
+
+
+def _check_shows(cell: Cell) -> None:
+    """Check what instruments are to show at first."""
+    known = _shown_names(cell)
+    wrong = [name for name in cell.file.simulation.shows if name not in known]
+    if wrong:
+        raise ConfigError(
+            f"{cell.path}: simulation.shows: {', '.join(wrong)} cannot be made to show a value",
+            hint=f"objects that can: {', '.join(known)}",
+            key="simulation.shows",
+        )
 
 
 def _check_park(cell: Cell) -> None:

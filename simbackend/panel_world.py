@@ -89,6 +89,8 @@ class PanelWorld:
         self._order: list[str] = []
         for mechanism in self.mechanisms.values():
             mechanism.lock()
+        for name, value in cell.file.simulation.shows.items():
+            self.show(name, value)
 
     # -- building -------------------------------------------------------------------------------------------------
 

@@ -32,7 +32,7 @@ def run_week(cell: Path, seed: int | None, *, runs: Path, days: float, port: int
     """
     from service.serve import exit_on_sigterm
     from service.week.checks import checks_of, left_by
-    from service.week.files import write_plant
+    from service.week.files import keep_shown, write_plant
     from service.week.run import live_week, serve_week, times_of
 
     started_s, now_s = time.monotonic(), time.time()
@@ -55,6 +55,7 @@ def run_week(cell: Path, seed: int | None, *, runs: Path, days: float, port: int
                 console.print(f"{number:3d} of {count}  {_line(lived, service.plant)}", highlight=False, soft_wrap=True)
 
             week = live_week(panelwright, calendar, days=days, now_s=now_s, tell=tell)
+            keep_shown(plant, week.rounds[-1].truth)
             checks = list(checks_of(left_by(week, service.plant, service.cell.panel, plant, runs)))
             console.print(_table(checks))
             code = 0 if all(check.holds for check in checks) else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,16 @@ def write_plant(cell: Path, folder: Path, *, seed: int | None = None) -> Path:
     mission.parent.mkdir(exist_ok=True)
     mission.write_text(MISSION, encoding="utf-8")
     return copied.cell
+
+
+def keep_shown(cell: Path, shows: Mapping[str, float]) -> None:
+    """Write into the cell file what the instruments show at the end, so that a later service begins there."""
+    document = tomlkit.parse(cell.read_text(encoding="utf-8"))
+    table = tomlkit.inline_table()
+    table.update({name: round(value, 3) for name, value in shows.items()})
+    simulation = document.setdefault("simulation", tomlkit.table())
+    simulation["shows"] = table
+    cell.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
 def _check_objects(panel: Panel, cell: Path) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hal.errors import InvalidRequest
+from hal.config import load_cell
+from hal.errors import ConfigError, InvalidRequest
 from hal.simulated import ShowsValues
-from tests.simbackend.rig import SimCell, sim_cell
+from tests.simbackend.rig import ROOT, SimCell, sim_cell
 
 
 @pytest.fixture(scope="module")
@@ -56,3 +58,33 @@ def test_what_shows_no_value_of_a_process_is_refused(cell: SimCell) -> None:
     for name in ("main_valve", "no_such_object"):
         with pytest.raises(InvalidRequest, match="cannot be made to show a value"):
             arm.show(name, 1.0)
+
+
+def cell_that_shows(folder: Path, shows: str) -> Path:
+    text = (ROOT / "cells/bench.toml").read_text(encoding="utf-8")
+    for name in ("panels/", "cells/"):
+        text = text.replace(f'"{name}', f'"{ROOT}/{name}')
+    path = folder / "cell.toml"
+    path.write_text(f"{text}\n[simulation]\nshows = {shows}\n", encoding="utf-8")
+    return path
+
+
+def test_a_cell_file_says_what_instruments_show_at_first(tmp_path: Path) -> None:
+    path = cell_that_shows(tmp_path, "{ pressure = 4.25, run_lamp = 1, temperature = 55.5 }")
+    running = SimCell(cell=load_cell(path))
+    try:
+        arm = running.connect("arm")
+        assert [truth_of(arm, name).value for name in ("pressure", "temperature")] == [pytest.approx(4.25), 55.5]
+        assert truth_of(arm, "run_lamp").state == "on"
+    finally:
+        running.shared.close()
+
+
+def test_what_cannot_show_that_is_refused_by_its_key(tmp_path: Path) -> None:
+    running = SimCell(cell=load_cell(cell_that_shows(tmp_path, "{ main_valve = 1, steam = 2 }")))
+    with pytest.raises(ConfigError, match=r"simulation\.shows: main_valve, steam cannot be made"):
+        running.connect("arm")
+    text = cell_that_shows(tmp_path, "{ pressure = 1 }").read_text(encoding="utf-8")
+    (tmp_path / "cell.toml").write_text(text.replace('mode = "sim"', 'mode = "real"'), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"simulation\.shows needs"):
+        load_cell(tmp_path / "cell.toml")

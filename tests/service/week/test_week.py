@@ -15,7 +15,7 @@ from service.calendar import Calendar, by_calendar, calendar_clock
 from service.missions.files import checked_file
 from service.serve import Options, Panelwright
 from service.week.checks import Left, checks_of, left_by
-from service.week.files import LIMITS, write_plant
+from service.week.files import LIMITS, keep_shown, write_plant
 from service.week.run import DAY_S, live_week, serve_week, times_of
 from service.week.story import Story
 
@@ -94,6 +94,13 @@ def test_the_plant_has_the_limits_the_mission_and_the_round_and_is_written_once(
     assert "relieve" in str(checked_file("patrol", cell).mission)
     with pytest.raises(ConfigError, match="exists already"):
         write_plant(BENCH, tmp_path)
+
+
+def test_a_later_service_begins_with_what_was_shown_at_the_end(tmp_path: Path) -> None:
+    path = write_plant(BENCH, tmp_path)
+    for pressure in (4.2, 4.3):
+        keep_shown(path, {"pressure": pressure, "run_lamp": 0.0})
+    assert load_cell(path).file.simulation.shows == {"pressure": 4.3, "run_lamp": 0.0}
 
 
 def test_a_cell_that_is_not_simulated_or_has_another_panel_is_refused(tmp_path: Path) -> None:

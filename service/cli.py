@@ -43,7 +43,20 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import alarms, calibrate, devices, init, keys, missions, panel, review, rounds, serve, tasks
+    from service.commands import (
+        alarms,
+        calibrate,
+        devices,
+        init,
+        keys,
+        missions,
+        panel,
+        review,
+        rounds,
+        serve,
+        site,
+        tasks,
+    )
     from service.commands.backup import backup, restore
     from service.commands.certify import certify
     from service.commands.chaos import chaos
@@ -88,6 +101,7 @@ def _app() -> Callable[[], None]:
     app.add_typer(alarms.app, name="alarms")
     app.add_typer(rounds.app, name="rounds")
     app.add_typer(review.app, name="review")
+    app.add_typer(site.app, name="site")
     app.add_typer(keys.app, name="keys")
     plain = (backup, restore, conform, warm, teach, learn, read)
     for command in plain:

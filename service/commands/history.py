@@ -30,9 +30,16 @@ def history(
     last: Annotated[int, typer.Option(min=1, max=1000, help="Number of readings in the table, the newest ones.")] = 30,
     csv: Annotated[Path | None, typer.Option("--csv", help="Write all readings of that time to this CSV file.")] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the trend into this PNG file.")] = None,
+    folder: Annotated[
+        Path | None, typer.Option("--from", help="Ask a folder that `site collect` has filled, instead of a service.")
+    ] = None,
+    cell: Annotated[str | None, typer.Option("--of", help="With --from: only this cell.")] = None,
     url: Url = UrlDefault,
 ) -> None:
-    """Show the readings of one object from the history of a running service; times are UTC."""
+    """Show the readings of one object from the history of a running service, or of a site; times are UTC."""
+    if folder is not None:
+        history_of_site(folder, name, since=since, last=last, csv=csv, plot=plot, cell=cell)
+        return
     client, since_s = client_of(url), max(0.0, time.time() - seconds_of(since))
     if csv is not None:
         query = urlencode({"object": name, "since_s": f"{since_s:.3f}"})
@@ -72,13 +79,42 @@ def _readings(client: Client, name: str, since_s: float) -> list[dict[str, Any]]
     return found
 
 
-def _table(readings: list[dict[str, Any]]) -> Table:
-    table = Table("time", "shows", "sigma", "confidence", "told", "by", box=None, pad_edge=False)
+def history_of_site(
+    folder: Path, name: str, *, since: str, last: int, csv: Path | None, plot: Path | None, cell: str | None
+) -> None:
+    """Show the readings of one object in all cells of a folder, or in one."""
+    from csv import DictWriter
+
+    from service.site.ask import readings_of, trends_of
+
+    now_s = time.time()
+    since_s = max(0.0, now_s - seconds_of(since))
+    readings = readings_of(folder, name, since_s=since_s, cell=cell)
+    if not readings:
+        console.print(f"no reading of {name} since {since} ago in {folder}", style="yellow")
+        return
+    if csv is not None:
+        with csv.open("w", newline="", encoding="utf-8") as file:
+            writer = DictWriter(file, fieldnames=list(readings[0]))
+            writer.writeheader()
+            writer.writerows(readings)
+        console.print(f"readings: {csv}", markup=False)
+    if plot is not None:
+        trends = trends_of(folder, name, since_s=since_s, until_s=now_s, buckets=SPANS, cell=cell)
+        plot.write_bytes(drawn_of_cells(name, trends, unit=readings[-1]["unit"]))
+        console.print(f"trend: {plot}", markup=False)
+    console.print(_table(readings[-last:], has_cells=True))
+
+
+def _table(readings: list[dict[str, Any]], *, has_cells: bool = False) -> Table:
+    first = ("cell", "time") if has_cells else ("time",)
+    table = Table(*first, "shows", "sigma", "confidence", "told", "by", box=None, pad_edge=False)
     for one in readings:
         sigma = "" if one["sigma"] is None else f"{one['sigma']:.2g}"
         style = "" if one["quality"] == "valid" else "yellow"
         by = one["mission"] or f"{one['verb']} {one['task']}"
-        words = (_time(one["utc_s"]), _shown(one), sigma, f"{one['confidence']:.2f}", one["told"] or "", by)
+        when = (one["cell"], _time(one["utc_s"])) if has_cells else (_time(one["utc_s"]),)
+        words = (*when, _shown(one), sigma, f"{one['confidence']:.2f}", one["told"] or "", by)
         table.add_row(*(escape(word) for word in words), style=style)
     return table
 
@@ -114,6 +150,27 @@ def drawn(name: str, trend: list[dict[str, Any]], *, unit: str) -> bytes:
     axes.set_title(f"{name} (UTC){'; crosses are refused readings' if refused else ''}", fontsize=9, color=INK)
     figure.autofmt_xdate()
     return figure_png(figure)
+
+
+def drawn_of_cells(name: str, trends: dict[str, list[dict[str, Any]]], *, unit: str) -> bytes:
+    """Return the trends of an object in several cells as PNG: the mean of each span, or its states as dots."""
+    from service.report.plots import figure_png, sheet
+
+    figure = sheet(3.4)
+    axes: Any = figure.subplots()
+    for cell, trend in trends.items():
+        known = [(_middle(one), one["mean"]) for one in trend if one["mean"] is not None]
+        known = known or [(_middle(one), state) for one in trend for state in one["states"]]
+        axes.plot([when for when, _ in known], [value for _, value in known], ".-", ms=4, lw=1, label=cell)
+    axes.set_title(f"{name} (UTC)", fontsize=9, color=INK)
+    axes.set_ylabel(unit)
+    axes.legend(fontsize=8)
+    figure.autofmt_xdate()
+    return figure_png(figure)
+
+
+def _middle(one: dict[str, Any]) -> datetime:
+    return datetime.fromtimestamp((one["since_s"] + one["until_s"]) / 2, UTC)
 
 
 def _draw_values(axes: Any, moments: list[datetime], trend: list[dict[str, Any]]) -> None:

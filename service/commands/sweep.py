@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hal.errors import Unsupported
 from service.commands.common import DEFAULT_CELL, CellOption, console, find_cell
 from service.commands.shutdown import INTERRUPTED, leave, one_interrupt
 from service.commands.warm import compile_first
@@ -24,6 +25,9 @@ def sweep(
     *,
     first: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the first panel.")] = 1,
     panels: Annotated[int, typer.Option(min=1, help="Number of panels, of successive seeds.")] = 10,
+    seeds: Annotated[
+        str | None, typer.Option(help='Seeds such as "1-1000" or "1-20,40", in place of the two above.')
+    ] = None,
     cell: CellOption = DEFAULT_CELL,
     only: Annotated[
         str, typer.Option(help='Only these kinds or rows of the table, with commas between: "slider,wheel 720".')
@@ -38,7 +42,9 @@ def sweep(
     scheduler: Annotated[
         str, typer.Option(help='Scheduler: "local", or tcp://host:port of a dask scheduler.')
     ] = "local",
-    out: Annotated[Path, typer.Option(help="Folder for sweep.md and sweep.json.")] = Path("runs/sweep"),
+    out: Annotated[Path, typer.Option(help="Folder of the results; panels that it has are not run again.")] = Path(
+        "runs/sweep"
+    ),
     draw: Annotated[
         Path | None, typer.Option(help="Only write the panel and cell files into this folder, and run nothing.")
     ] = None,
@@ -48,26 +54,29 @@ def sweep(
     The exit code is 1 when a control was said to be done and was not, or when something moved that was not named.
     """
     from service.sweep.files import write_files
+    from service.sweep.kept import seeds_of
     from service.sweep.options import SweepOptions, chosen
 
     options = SweepOptions(cell=find_cell(cell).resolve(), only=chosen(only), known_pose=known_pose, mission=mission)
-    seeds = range(first, first + panels)
+    chosen_seeds = list(range(first, first + panels)) if seeds is None else seeds_of(seeds)
     if draw is not None:
-        for seed in seeds:
+        for seed in chosen_seeds:
             (draw / str(seed)).mkdir(parents=True, exist_ok=True)
             console.print(f"wrote {write_files(seed, options.cell, draw / str(seed))}", markup=False)
         return
     compile_first()
-    leave(_run(seeds, options, scheduler=scheduler, workers=workers, out=out))
+    leave(_run(chosen_seeds, options, scheduler=scheduler, workers=workers, out=out))
 
 
 def _run(seeds: Sequence[int], options: SweepOptions, *, scheduler: str, workers: int, out: Path) -> int:
     """Run the panels, print and write the tables of those that have ended, and return the exit code."""
+    from service.sweep.kept import Kept
     from service.sweep.sweep import sweep as run_sweep
     from service.sweep.sweep import write
     from service.sweep.table import report
 
     runs: list[PanelRun] = []
+    kept = Kept(out, options)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     code = 0
     with one_interrupt(), Progress(*columns, console=console) as bar:
@@ -80,14 +89,26 @@ def _run(seeds: Sequence[int], options: SweepOptions, *, scheduler: str, workers
             bar.console.print(_lines(run, each=len(seeds) == 1))
 
         try:
-            runs = run_sweep(seeds, options, scheduler=scheduler, workers=workers, progress=note)
+            runs = run_sweep(seeds, options, scheduler=scheduler, workers=workers, progress=note, kept=kept)
         except KeyboardInterrupt:
             code = INTERRUPTED
     if runs:
         console.print(report(runs), markup=False, highlight=False)
-        console.print("wrote " + ", ".join(str(path) for path in write(runs, options, out)), markup=False)
+        written = [*write(runs, options, out), *_parquet(runs, out)]
+        console.print("wrote " + ", ".join(str(path) for path in written), markup=False)
     is_untrue = any(deed.is_untrue for run in runs for deed in run.deeds)
     return code or (1 if is_untrue or any(run.problem for run in runs) else 0)
+
+
+def _parquet(runs: Sequence[PanelRun], out: Path) -> tuple[Path, ...]:
+    """Write the Parquet files; without DuckDB there are none, which is said."""
+    from service.sweep.parquet import write_parquet
+
+    try:
+        return write_parquet(runs, out)
+    except Unsupported as error:
+        console.print(f"without Parquet files: {error.what}; {error.hint}", markup=False)
+        return ()
 
 
 def _lines(run: PanelRun, *, each: bool) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 
 from hal.workers import as_they_end, workers_of
 from service.sweep.ask import PanelRun
+from service.sweep.kept import Kept
 from service.sweep.options import SweepOptions
 from service.sweep.run import run_panel
 from service.sweep.table import report
@@ -31,10 +32,12 @@ def sweep(
     scheduler: str = LOCAL,
     workers: int = 1,
     progress: Callable[[PanelRun], None] = lambda _run: None,
+    kept: Kept | None = None,
 ) -> list[PanelRun]:
     """Run the panels of the seeds; returns them in the order of the seeds.
 
     Args:
+        kept: where each panel is kept as it ends; those that it has are not run again.
         scheduler: `local`, or `tcp://host:port` of a dask scheduler whose workers see the cell file under the same path.
         workers: number of processes of the local scheduler; with one, everything runs in this process.
         progress: called with each panel as it ends.
@@ -42,19 +45,34 @@ def sweep(
     Raises:
         ConfigError: the scheduler does not answer, or no worker is left.
     """
+    earlier = [] if kept is None else [run for seed in seeds if (run := kept.run_of(seed)) is not None]
     runs: list[PanelRun] = []
+
+    def note(run: PanelRun) -> None:
+        runs.append(run)
+        if kept is not None and run not in earlier:
+            kept.keep(run)
+        progress(run)
+
+    for run in earlier:
+        note(run)
+    left = [seed for seed in seeds if seed not in {run.seed for run in earlier}]
     if scheduler == LOCAL and workers == 1:
-        for seed in seeds:
-            runs.append(run_panel(seed, options))
-            progress(runs[-1])
-        return runs
+        for seed in left:
+            note(run_panel(seed, options))
+    elif left:
+        _on_workers(left, options, scheduler, workers, note)
+    return sorted(runs, key=lambda run: list(seeds).index(run.seed))
+
+
+def _on_workers(
+    seeds: Sequence[int], options: SweepOptions, scheduler: str, workers: int, note: Callable[[PanelRun], None]
+) -> None:
     with workers_of(scheduler, workers) as client:
         task = partial(run_panel, options=options)
         futures = client.map(task, list(seeds), retries=RETRIES, pure=False)
         for run in as_they_end(client, futures):
-            runs.append(run)
-            progress(run)
-    return sorted(runs, key=lambda run: list(seeds).index(run.seed))
+            note(run)
 
 
 def hash_of(run: PanelRun) -> str:

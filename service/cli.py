@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import typer
 
 
 def main() -> None:
@@ -43,20 +47,7 @@ def main() -> None:
 def _app() -> Callable[[], None]:
     import typer
 
-    from service.commands import (
-        alarms,
-        calibrate,
-        devices,
-        init,
-        keys,
-        missions,
-        panel,
-        review,
-        rounds,
-        serve,
-        site,
-        tasks,
-    )
+    from service.commands import init, serve, sweep, tasks
     from service.commands.backup import backup, restore
     from service.commands.certify import certify
     from service.commands.chaos import chaos
@@ -74,44 +65,46 @@ def _app() -> Callable[[], None]:
     from service.commands.read import read
     from service.commands.record import record, replay
     from service.commands.report import report
-    from service.commands.sweep import sweep
     from service.commands.teach import teach
     from service.commands.version import root
     from service.commands.warm import warm
 
-    app = typer.Typer(
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-    )
-
+    app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
     app.callback()(root)
     app.add_typer(init.app)  # without a name of its own, so it is one command
     app.add_typer(serve.app)  # as `init`
-    plain: tuple[Callable[..., None], ...] = (demo, record, replay, sweep, certify, chaos, foxglove, doctor, check)
+    app.add_typer(sweep.app)
+    plain: list[Callable[..., None]] = [demo, record, replay, certify, chaos, foxglove, doctor, check, drivers]
+    plain += [tasks.stop, inspect, journal, history, report, backup, restore, conform, warm, teach, learn, read]
     for command in plain:
-        app.command()(command)
-    app.add_typer(devices.app, name="devices")
-    app.command()(drivers)
-    app.add_typer(tasks.app, name="task")
-    app.add_typer(missions.app, name="mission")
-    app.add_typer(panel.app, name="panel")
-    for command in (tasks.stop, inspect, journal, history, report):
         app.command()(command)
     app.command("set")(set_object)
-    app.add_typer(alarms.app, name="alarms")
-    app.add_typer(rounds.app, name="rounds")
-    app.add_typer(review.app, name="review")
-    app.add_typer(site.app, name="site")
-    app.add_typer(keys.app, name="keys")
-    plain = (backup, restore, conform, warm, teach, learn, read)
-    for command in plain:
-        app.command()(command)
-    app.add_typer(calibrate.app, name="calibrate")
     app.command("range")(range_image)
     app.add_typer(batch, name="batch")
     app.command()(emulate)
     app.command("new-driver")(new_driver)
+    _add_groups(app)
     return app
+
+
+def _add_groups(app: typer.Typer) -> None:
+    """Add the commands that have commands of their own."""
+    from service.commands import alarms, calibrate, devices, keys, missions, panel, review, rounds, site, tasks
+
+    groups = {
+        "devices": devices.app,
+        "task": tasks.app,
+        "mission": missions.app,
+        "panel": panel.app,
+        "alarms": alarms.app,
+        "rounds": rounds.app,
+        "review": review.app,
+        "site": site.app,
+        "keys": keys.app,
+        "calibrate": calibrate.app,
+    }
+    for name, group in groups.items():
+        app.add_typer(group, name=name)
 
 
 if __name__ == "__main__":

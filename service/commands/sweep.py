@@ -21,13 +21,18 @@ if TYPE_CHECKING:
     from service.sweep.options import SweepOptions
 
 
+Seeds = Annotated[str | None, typer.Option(help='Seeds such as "1-1000" or "1-20,40", in place of the two above.')]
+Out = Annotated[Path, typer.Option(help="Folder of the results; panels that it has are not run again.")]
+
+app = typer.Typer()
+
+
+@app.command()
 def sweep(
     *,
     first: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the first panel.")] = 1,
     panels: Annotated[int, typer.Option(min=1, help="Number of panels, of successive seeds.")] = 10,
-    seeds: Annotated[
-        str | None, typer.Option(help='Seeds such as "1-1000" or "1-20,40", in place of the two above.')
-    ] = None,
+    seeds: Seeds = None,
     cell: CellOption = DEFAULT_CELL,
     only: Annotated[
         str, typer.Option(help='Only these kinds or rows of the table, with commas between: "slider,wheel 720".')
@@ -42,9 +47,7 @@ def sweep(
     scheduler: Annotated[
         str, typer.Option(help='Scheduler: "local", or tcp://host:port of a dask scheduler.')
     ] = "local",
-    out: Annotated[Path, typer.Option(help="Folder of the results; panels that it has are not run again.")] = Path(
-        "runs/sweep"
-    ),
+    out: Out = Path("runs/sweep"),
     draw: Annotated[
         Path | None, typer.Option(help="Only write the panel and cell files into this folder, and run nothing.")
     ] = None,
@@ -53,19 +56,25 @@ def sweep(
 
     The exit code is 1 when a control was said to be done and was not, or when something moved that was not named.
     """
-    from service.sweep.files import write_files
     from service.sweep.kept import seeds_of
     from service.sweep.options import SweepOptions, chosen
 
     options = SweepOptions(cell=find_cell(cell).resolve(), only=chosen(only), known_pose=known_pose, mission=mission)
     chosen_seeds = list(range(first, first + panels)) if seeds is None else seeds_of(seeds)
     if draw is not None:
-        for seed in chosen_seeds:
-            (draw / str(seed)).mkdir(parents=True, exist_ok=True)
-            console.print(f"wrote {write_files(seed, options.cell, draw / str(seed))}", markup=False)
+        _draw(chosen_seeds, options, draw)
         return
     compile_first()
     leave(_run(chosen_seeds, options, scheduler=scheduler, workers=workers, out=out))
+
+
+def _draw(seeds: Sequence[int], options: SweepOptions, folder: Path) -> None:
+    """Write the panel and cell files of each seed."""
+    from service.sweep.files import write_files
+
+    for seed in seeds:
+        (folder / str(seed)).mkdir(parents=True, exist_ok=True)
+        console.print(f"wrote {write_files(seed, options.cell, folder / str(seed))}", markup=False)
 
 
 def _run(seeds: Sequence[int], options: SweepOptions, *, scheduler: str, workers: int, out: Path) -> int:

@@ -24,6 +24,29 @@ class _Block:
     squares_n2: float = 0.0
 
 
+def contacts_of(contacts: Sequence[Any], arm: int) -> list[Any]:
+    """Return the contact points of the arm, with the forces on the arm, from all contact points of the engine.
+
+    The engine gives the forces on the first of two bodies. Asked for one body only, it puts that body first and turns the
+    normals round, but not the friction, which then counts with the wrong sign: two forces of 127 N that kept each other in
+    balance appeared as 236 N.
+    """
+    found = []
+    for contact in contacts:
+        if contact[1] == arm:
+            found.append(contact)
+        elif contact[2] == arm:
+            found.append(_turned_round(contact))
+    return found
+
+
+def _turned_round(contact: Any) -> tuple[Any, ...]:
+    """Return a contact point with its two bodies exchanged, and with that the directions of its forces."""
+    flags, a, b, link_a, link_b, on_a, on_b, normal, gap_m, *forces = contact
+    turned = [tuple(-x for x in one) if isinstance(one, tuple) else one for one in forces]
+    return (flags, b, a, link_b, link_a, on_b, on_a, tuple(-x for x in normal), gap_m, *turned)
+
+
 class ContactLog:
     """Peak, impulse and chatter of the contact force since any time that is kept.
 

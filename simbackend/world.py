@@ -17,7 +17,7 @@ from hal.arrays import Array
 from hal.simulated import ObjectTruth, Truth
 from simbackend import panel_events
 from simbackend.arm_model import MODELS, arm_urdf, base_from_flange
-from simbackend.contact_log import ContactLog
+from simbackend.contact_log import ContactLog, contacts_of
 from simbackend.draws import Draws
 from simbackend.drive import ArmDrive, GripperDrive
 from simbackend.pads import Pads, Roots
@@ -217,7 +217,7 @@ class World:
             self.tip_m = engine.getLinkState(self.arm, self.gripper_link)[4]
 
     def _read_contacts(self) -> None:
-        contacts = self.engine.getContactPoints(bodyA=self.arm)
+        contacts = contacts_of(self.engine.getContactPoints(), self.arm)
         self.pads.note(contacts)
         if contacts:
             self._forces_on.note(contacts)

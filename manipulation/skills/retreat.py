@@ -21,7 +21,7 @@ from manipulation.skills.attempt import LET_GO_N, PADS_M_PER_S, RETREAT_M, RETRE
 from manipulation.skills.context import SkillContext
 from manipulation.skills.outcome import SkillFailure
 
-PULL_N = (40.0, 60.0, 80.0)  # of one pull after the other; the last one is below the cell's protective limit
+PULL_N = (40.0, 50.0, 60.0)  # of one pull after the other; nothing on a panel is pulled harder to free a hand
 PULL_M_PER_S = 0.04  # of a hand that is held; at 0.15 m/s the force overshoots by 25 N
 PULLS = len(PULL_N)
 OPEN_MORE_M = 0.02

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.motion import Compliance, Guard, MotionReport, Quantity
 from hal.panel import Handwheel
-from manipulation.planning.cartesian_path import arc, through
+from manipulation.planning.cartesian_path import arc, through, turned_about
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.contact import relax
 from manipulation.skills.outcome import Outcome, SkillFailure
@@ -35,6 +35,13 @@ INF = float("inf")
 DAMPING = (4000.0, 4000.0, 4000.0, 10.0, 10.0, 10.0)
 MASS = (400.0, 400.0, 400.0, 1.0, 1.0, 1.0)  # with 100 kg friction flips from tick to tick
 MAX_OFFSET_M = 0.008
+STEP_RAD = 0.03
+FREEING_N, FREEING_M_PER_S = 40.0, 0.06
+# Stiff enough to come back to the hub against the friction of fingers on spokes, soft enough for a rim that is met on the way.
+FREEING = Compliance(
+    stiffness=(1500.0, 1500.0, 400.0, INF, INF, INF), damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0),
+    mass=(100.0, 100.0, 400.0, 1.0, 1.0, 1.0), max_offset_m=MAX_OFFSET_M,
+)  # fmt: skip
 LOADING_DAMPING, LOADING_MASS = (1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0), (150.0, 150.0, 400.0, 1.0, 1.0, 1.0)
 
 
@@ -68,11 +75,13 @@ class WheelTurn:
     _felt: Felt = field(default_factory=Felt)
     _side_n: float = 0.0
     _grip_from_hub: RigidTransform = field(init=False)
+    _start: RigidTransform = field(init=False)
 
     def __post_init__(self) -> None:
         grip = self.attempt.pose()
         hub = grip.inv().apply(self.attempt.context.panel_pose.apply([*self.wheel.position_m, 0.0]))
         self._grip_from_hub = RigidTransform.from_translation([0.0 if self.is_across else hub[0], hub[1], 0.0])
+        self._start = self._tool()
 
     @property
     def felt_nm(self) -> float:
@@ -90,14 +99,13 @@ class WheelTurn:
         Raises:
             SkillFailure: `stiff`, `stalled` or `slipped`.
         """
-        start = self._tool()
         goal_rad = self.behind_rad + min(FIRST_RAD, span_rad)
         limit_rad = self.behind_rad + LAG_RAD + span_rad
         while True:
             report = self._turn_on(goal_rad)
             x_n, torque_nm = np.median(report.log.wrench[-SIDE_SAMPLES:][:, [0, 5]], axis=0)
             self._side_n = float(np.sign(x_n) * self.side_per_nm * max(0.0, -self.sign * torque_nm))
-            felt = self._felt = felt_in(self._felt, *self._log(report, start))
+            felt = self._felt = felt_in(self._felt, *self._log(report))
             self.moved_rad = felt.moved_rad
             if report.tripped == "slip" or felt.has_slipped:
                 raise SkillFailure(Outcome.SLIPPED, f"the fingers slipped at {felt.peak_nm:.1f} N m")
@@ -113,11 +121,38 @@ class WheelTurn:
             goal_rad = min(felt.end_rad + (left_rad if felt.is_moving else min(left_rad, NEXT_RAD)), limit_rad)
 
     def let_go(self) -> None:
-        """Release the wheel, yield until nothing presses on the hand, and move back."""
+        """Release the wheel, yield until nothing presses on the hand, bring the fingers clear of it, and move back."""
         if self.open_m is not None:
             self.attempt.open_to(self.open_m, name="let go")
         relax(self.attempt)
+        if self.open_m is None and not self._felt.has_slipped:
+            self._stand_free()
         self.attempt.leave(self.up_m)
+
+    def _stand_free(self) -> None:
+        """Turn the hand back to where its fingers stand to the spokes as when they came down, where the way out is free.
+
+        A finger that is wedged between spoke, rim and hub presses on the wheel in opposite directions. The wrist feels
+        none of it, an arm that gives way does not end it, and its friction holds the hand that moves back.
+        """
+        goal = turned_about(self._start, self._start.translation, self._axis(), self.sign * self.moved_rad)
+        here = self._tool()
+        back_rad = float((goal.rotation * here.rotation.inv()).as_rotvec() @ self._axis())
+        count = 2 + int(abs(back_rad) / STEP_RAD)
+        shares = np.linspace(0.0, 1.0, count)
+        poses = [
+            RigidTransform.from_components(
+                here.translation + share * (goal.translation - here.translation),
+                Rotation.from_rotvec(share * back_rad * self._axis()) * here.rotation,
+            )
+            for share in shares
+        ]
+        held = Guard(name="held", quantity=Quantity.FORCE, limit=FREEING_N, ticks=SIDE_TICKS)
+        motion = through(
+            poses, name="stand free", speed_m_per_s=FREEING_M_PER_S, guards=(held,), compliance=FREEING,
+            flange_from_tool=self.attempt.context.flange_from_grip * self._grip_from_hub,
+        )  # fmt: skip
+        self.attempt.run(motion)
 
     def _axis(self) -> Array:
         clockwise: Array = self.attempt.context.panel_pose.rotation.apply([0.0, 0.0, -1.0])
@@ -177,13 +212,15 @@ class WheelTurn:
             side,
         )  # fmt: skip
 
-    def _log(self, report: MotionReport, start: RigidTransform) -> tuple[Array, Array]:
+    def _log(self, report: MotionReport) -> tuple[Array, Array]:
         """Return the turns of the hand (N,) since it came down, and the torques against them (N,)."""
         context, log = self.attempt.context, report.log
         rows = np.unique(np.linspace(0, len(log.times_s) - 1, LOG_SAMPLES).astype(int))
         tool = context.flange_from_grip * self._grip_from_hub
         poses = [context.kinematics.tool(q, tool) for q in log.positions_rad[rows]]
-        turned = [self.sign * float((p.rotation * start.rotation.inv()).as_rotvec() @ self._axis()) for p in poses]
+        turned = [
+            self.sign * float((p.rotation * self._start.rotation.inv()).as_rotvec() @ self._axis()) for p in poses
+        ]
         # A turn of more than half a revolution appears with the other sign; it continues from where the last one ended.
         near = self._felt.end_rad + np.unwrap(np.array(turned) - self._felt.end_rad)
         near += 2.0 * np.pi * np.round((self._felt.end_rad - near[0]) / (2.0 * np.pi))

@@ -64,7 +64,7 @@ def measure(name: str, rate_hz: float, prefix: Sequence[str], seconds: float) ->
         latch.reset("the benchmark", seen_count=latch.state().count)
         with control_probe(Path(folder) / "latch", rate_hz=rate_hz, prefix=prefix) as probe:
             command = [*prefix, sys.executable, "-c", FLOOR, str(1.0 / rate_hz), str(seconds)]
-            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as floor:
+            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as floor:
                 found = probe.ticks(seconds)
                 assert floor.stdout is not None
                 bare = Ticks.of(json.loads(floor.stdout.readline()), 1.0 / rate_hz)

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from hal.cpu_affinity import share_core
 from hal.errors import MotionRefused
+from hal.priorities import Priority, take_priority
 
 T = TypeVar("T")
 
@@ -73,6 +74,8 @@ class ControlThread:
     def _loop(self) -> None:
         if self._beat is None:
             share_core(os.getpid())
+        else:
+            take_priority(Priority.CONTROL)
         try:
             while not self._is_closing:
                 self._turn()

@@ -15,6 +15,7 @@ from fastapi import FastAPI
 from nicegui import app as nicegui_app
 from nicegui import ui
 
+from hal.priorities import Priority, take_priority
 from service.console import (
     alarms_page,
     cell_page,
@@ -98,6 +99,7 @@ def main() -> None:
     parser.add_argument("--stop-port", type=int, required=True)
     parser.add_argument("--cookie", required=True, help="name of the cookie in which the service keeps a session")
     options = parser.parse_args()
+    take_priority(Priority.CLIENT)
     lifeline = Lifeline()
     listener = socket.socket(fileno=options.fd)
     ready = threading.Event()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hal.outlets import OutletsSection
+from hal.priorities import Priority, take_priority
 from service.outlets.api import ApiSource
 from service.outlets.deliver import password_of, secret_in
 from service.outlets.source import CursorFile, Source
@@ -92,6 +93,7 @@ def main() -> None:
     parser.add_argument("--cell", required=True)
     parser.add_argument("--folder", type=Path, required=True, help="folder for cursors and dead letters")
     options = parser.parse_args()
+    take_priority(Priority.CLIENT)
     logging.basicConfig(level=logging.INFO, format="gateway: %(message)s")
     logging.getLogger("httpx2").setLevel(logging.WARNING)
     section = OutletsSection.model_validate_json(os.environ.pop(OUTLETS))

@@ -13,13 +13,13 @@ import argparse
 import asyncio
 import contextlib
 import json
-import os
 import signal
 import socket
 import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from hal.priorities import Priority, take_priority
 from hal.process_state import MOVES, set_memory_priority
 from service.processes.beat import PERIOD_S, SILENCE_S, Beat
 from service.processes.latch import LATCH, Latch, LatchState
@@ -231,8 +231,7 @@ def main() -> None:
     parser.add_argument("--origin", action="append", default=[])
     options = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
-    with contextlib.suppress(OSError):
-        os.nice(-10)  # only root may raise the priority; the process works without it
+    take_priority(Priority.STOP)
     set_memory_priority(MOVES)
     with Latch(options.folder / LATCH) as latch, socket.socket(fileno=options.fd) as listener:
         watchdog = Watchdog(latch, options.folder, silence_s=options.silence)

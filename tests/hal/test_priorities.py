@@ -1,0 +1,49 @@
+"""Tests what a thread gets from the table of priorities, by what the operating system says of it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import threading
+
+import pytest
+
+from hal.priorities import ATTRIBUTES, CALLS, Priority, take_priority
+
+pytestmark = pytest.mark.skipif(platform.machine() not in CALLS, reason="the system call is not known here")
+
+
+def niceness_and_turn_s() -> tuple[int, float]:
+    """Return what the operating system says of the calling thread; sched_getattr is the call after sched_setattr."""
+    found = ctypes.create_string_buffer(ATTRIBUTES.size)
+    ctypes.CDLL(None).syscall(CALLS[platform.machine()] + 1, 0, found, ATTRIBUTES.size, 0)
+    _size, _policy, _flags, niceness, _priority, turn_ns, _deadline, _period = ATTRIBUTES.unpack(found.raw)
+    return niceness, 1e-9 * turn_ns
+
+
+def in_a_thread(priority: Priority) -> tuple[int, float]:
+    seen: list[tuple[int, float]] = []
+
+    def work() -> None:
+        take_priority(priority)
+        seen.append(niceness_and_turn_s())
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    return seen[0]
+
+
+def test_the_control_thread_has_short_turns_and_its_niceness_stays() -> None:
+    niceness, turn_s = niceness_and_turn_s()
+    if turn_s == 0.0:
+        pytest.skip("this version of Linux has no turns of a chosen length")
+    assert in_a_thread(Priority.CONTROL) == pytest.approx((niceness, 0.0001))
+    assert niceness_and_turn_s() == (niceness, turn_s)
+
+
+def test_a_client_is_nicer_than_its_parent() -> None:
+    niceness = os.getpriority(os.PRIO_PROCESS, 0)
+    assert in_a_thread(Priority.CLIENT)[0] == min(19, niceness + 5)
+    assert os.getpriority(os.PRIO_PROCESS, 0) == niceness

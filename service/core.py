@@ -185,7 +185,8 @@ class Service:
         asked = request.model_dump(mode="json")
         sub = self.lease.lend(is_own=is_followed and holder is None) if moves else None
         work = self._work(operation, request, command=command, observe=observe, sub=sub, stops_seen=latch.count)
-        task = self.tasks.start(verb, asked, work, moves=moves, holder=holder, key=key, sub_lease=sub, client=client)
+        start = partial(self.tasks.start, holder=holder, key=key, sub_lease=sub, client=client)
+        task = start(verb, asked, work, moves=moves, can_pause=operation.can_pause and moves)
         if moves:
             self._confirm(task, command.token)
         return task

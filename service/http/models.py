@@ -52,6 +52,11 @@ class TaskView(BaseModel):
         None
     )
     moves: bool = True
+    can_pause: Annotated[bool, Field(description="whether it can stand still between its steps")] = False
+    pause: Annotated[
+        Literal["no", "asked", "held"],
+        Field(description="held: it stands still between two steps until it is told to go on"),
+    ] = "no"
     created_s: Annotated[float, Field(description="wall time, seconds since 1970")]
     started_s: float | None = None
     ended_s: float | None = None
@@ -83,6 +88,8 @@ class TaskView(BaseModel):
             by=task.by,
             sub_lease=task.sub_lease.name if task.sub_lease is not None else None,
             moves=task.moves,
+            can_pause=task.can_pause,
+            pause="no" if state.is_final else task.pause,
             created_s=task.created_s,
             started_s=task.started_s,
             ended_s=task.ended_s,

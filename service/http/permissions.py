@@ -90,6 +90,8 @@ TABLE: dict[str, Row] = {
     "POST /v1/lease/release": LEASING,
     "POST /v1/lease/take-over": LEASING,
     "POST /v1/stop/reset": OPERATOR_WRITES,
+    "POST /v1/tasks/{task_id}/pause": OPERATOR_WRITES,
+    "POST /v1/tasks/{task_id}/go-on": OPERATOR_WRITES,
     "POST /v1/devices/{name}/connect": OPERATOR_WRITES,
     "POST /v1/images": OPERATOR_WRITES,
     "DELETE /v1/images/{image_id}": OPERATOR_WRITES,

@@ -14,7 +14,7 @@ from starlette.responses import FileResponse
 from service.access.actor import actor
 from service.http.models import TaskList, TaskView, event_data
 from service.http.problems import RESPONSES
-from service.http.state import AppState, LeaseToken, State
+from service.http.state import Admitted, AppState, LeaseToken, State
 from service.http.verbs import Wait
 from service.tasks.model import Task, TaskState
 
@@ -49,6 +49,19 @@ async def cancel_task(state: State, task_id: TaskId, lease_token: LeaseToken = N
     if wait_s > 0.0:
         await state.hub.wait_for(task, wait_s)
     return TaskView.of(task)
+
+
+@router.post("/{task_id}/pause", summary="Stand still before the next step of a mission", operation_id="pause_task")
+async def pause_task(state: State, holder: Admitted, task_id: TaskId) -> TaskView:
+    """The task keeps its right to move, and the arm stands still until `go-on`; the journal says who asked."""
+    del holder
+    return TaskView.of(await state.act(functools.partial(state.service.tasks.pause, task_id)))
+
+
+@router.post("/{task_id}/go-on", summary="Let a paused mission go on", operation_id="let_task_go_on")
+async def let_task_go_on(state: State, holder: Admitted, task_id: TaskId) -> TaskView:
+    del holder
+    return TaskView.of(await state.act(functools.partial(state.service.tasks.go_on, task_id)))
 
 
 def _followed(state: AppState, task: Task) -> AbstractContextManager[None]:

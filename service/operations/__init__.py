@@ -39,6 +39,7 @@ class Operation:
         writes: whether it stores something that others see, even if nothing moves (needs the lease when one is held).
         needs: kinds of devices that it may need in addition to those of every motion (`moves`).
         is_still: returns whether a given request moves nothing although the verb may move the arm.
+        can_pause: whether it has steps between which it can stand still.
         check: raises `InvalidRequest`, before a task is created, for a request that is not possible in this cell.
         check_with_arm: the same where it takes the arm to know that.
     """
@@ -52,6 +53,7 @@ class Operation:
     moves: bool = True
     writes: bool = False
     needs: tuple[DeviceKind, ...] = ()
+    can_pause: bool = False
     is_still: Callable[[Any], bool] = field(default=lambda _request: False)
     check: Callable[[Cell, Any], None] = field(default=lambda _cell, _request: None)
     check_with_arm: Callable[[Cell, Any, Arm], None] = field(default=lambda _cell, _request, _arm: None)
@@ -195,6 +197,7 @@ OPERATIONS: dict[str, Operation] = {
             needs=SENSORS,
             summary="Run a mission and write its report; without a mission, inspect and touch nothing",
             example={"file": "demo"},
+            can_pause=True,
             is_still=lambda request: request.dry_run,
             check_with_arm=_checked_by("check_mission"),
         ),

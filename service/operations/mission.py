@@ -181,7 +181,7 @@ class _Worker:
 
     def begins(self, path: str, kind: str) -> None:
         self._begun += kind not in ("choose", "repeat", "call")
-        self.session.part(*self._span(0.0, 0.0)).progress(0.0, f"step {path}")
+        self.session.part(*self._span(0.0, 0.0)).begin_step(path)
 
     def now_s(self) -> float:
         return self.session.connection.clock.now_s()

@@ -13,7 +13,7 @@ from hal.devices import DeviceKind
 from hal.errors import ConfigError, DeviceFault, InvalidRequest, MotionError, NotFound, Stopped
 from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
-from hal.motion import DeclaredMotion, MotionOutcome, MotionReport, Mover, RobotState
+from hal.motion import DeclaredMotion, Hold, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
 from service.history.observer import NoObserver, Observer
 from service.processes.connection import CellConnection
@@ -21,6 +21,8 @@ from service.report.record import MissionRecord
 from service.schema.requests import InspectRequest, RecogniseRequest
 from service.tasks.store import TaskContext
 from service.world_model import WorldModel, expected_panel
+
+PAUSE_HOLD_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,6 +214,24 @@ class Session:
     def believed_panel(self) -> UncertainPose:
         """Return the newest estimate of the panel's pose, or the pose that the cell file expects."""
         return self.world.base_from_panel or expected_panel(self.cell)
+
+    def begin_step(self, path: str) -> None:
+        """Report that a step of a mission begins, and hold the arm before it for as long as the task is paused.
+
+        The holds are no part of the record.
+
+        Raises:
+            Cancelled: the task was cancelled.
+            Stopped, DeviceFault, MotionError: a hold ended otherwise than wanted.
+        """
+
+        def hold() -> None:
+            report = self.context.connection.mover.execute(Hold(name="pause", duration_s=PAUSE_HOLD_S))
+            if report.outcome is not MotionOutcome.COMPLETED:
+                raise self.failure(report)
+
+        self.progress(0.0, f"step {path}")
+        self.context.task.pause_point(hold)
 
     def failure(self, report: MotionReport) -> Exception:
         """Return the error for a motion that ended otherwise than wanted."""

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 from service.problem import ProblemFields
 from service.tasks.sub_leases import SubLease
@@ -71,6 +71,13 @@ class Artefact:
         return re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", text) is not None
 
 
+def set_event() -> threading.Event:
+    """Return an event that is set."""
+    event = threading.Event()
+    event.set()
+    return event
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class Task:
     """One task. Its methods may be called from any thread.
@@ -82,6 +89,9 @@ class Task:
         key: the caller's idempotency key.
         sub_lease: its right to move; None when it does not move, and for a task of an earlier run.
         client: the machine that asked for it; tasks of one client may not fill the queue.
+        can_pause: whether its work has steps between which it can stand still.
+        goes_on: cleared while somebody wants it to pause.
+        is_held: whether it stands still between two steps now.
         problem: why it failed, as plain values.
         created_s, started_s, ended_s: wall time, for display only.
     """
@@ -95,6 +105,9 @@ class Task:
     key: str | None = None
     sub_lease: SubLease | None = None
     client: str | None = None
+    can_pause: bool = False
+    goes_on: threading.Event = field(default_factory=set_event)
+    is_held: bool = False
     state: TaskState = TaskState.QUEUED
     result: Any = None
     problem: ProblemFields | None = None
@@ -113,6 +126,13 @@ class Task:
     def fraction(self) -> float:
         """Progress of the work, from 0 to 1."""
         return self.events[-1].fraction if self.events else 0.0
+
+    @property
+    def pause(self) -> Literal["no", "asked", "held"]:
+        """Whether somebody wants it to pause, and whether it stands still already."""
+        if self.goes_on.is_set():
+            return "no"
+        return "held" if self.is_held else "asked"
 
     @property
     def step(self) -> str:

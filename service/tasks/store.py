@@ -18,13 +18,13 @@ from service.access.actor import actor
 from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow, of_file
 from service.jsonable import jsonable
 from service.problem import problem_of
+from service.tasks.context import TaskContext
 from service.tasks.model import Artefact, Task, TaskEvent, TaskState
 from service.tasks.sub_leases import SubLease
 
 __all__ = ["Artefact", "Task", "TaskContext", "TaskEvent", "TaskRecorder", "TaskState", "TaskStore"]
 
 CANCEL_REPEAT_S = 0.05  # repeated, because a cancel between two motions must also end the second one
-MAX_ARTEFACT_BYTES = 64_000_000
 log = logging.getLogger(__name__)
 
 
@@ -34,58 +34,6 @@ class TaskRecorder(Protocol):
     def append(self, kind: str, data: dict[str, Any]) -> None:
         """Record durably before returning; raises `JournalError`."""
         ...
-
-
-class TaskContext:
-    """The interface of a task for the operation that it runs."""
-
-    def __init__(self, task: Task, folder: Path) -> None:
-        self._task = task
-        self._folder = folder
-
-    @property
-    def id(self) -> str:
-        """Identity of the task."""
-        return self._task.id
-
-    @property
-    def is_cancelled(self) -> bool:
-        """Whether cancellation of this task was requested."""
-        return self._task.cancel_asked.is_set()
-
-    def progress(self, fraction: float, step: str, detail: str = "") -> None:
-        """Report the progress (0 to 1) and the present step.
-
-        Raises:
-            Cancelled: the task was cancelled.
-        """
-        self.check_cancelled()
-        self._task.add_event("progress", fraction=min(1.0, max(0.0, fraction)), step=step, detail=detail)
-
-    def check_cancelled(self) -> None:
-        """Raise `Cancelled` when cancellation of this task was requested."""
-        if self.is_cancelled:
-            raise Cancelled(
-                f"task {self._task.id} was cancelled: {self._task.cancel_reason}",
-                hint="start it again when ready",
-                task=self._task.id,
-            )
-
-    def artefact(self, name: str, data: bytes, media_type: str) -> str:
-        """Store a file with the task; returns its URL path.
-
-        Raises:
-            InvalidRequest: the name is not a plain file name, or the file is too large.
-        """
-        if not Artefact.is_name(name) or len(data) > MAX_ARTEFACT_BYTES:
-            raise InvalidRequest(
-                f"artefact {name!r} has a bad name or more than {MAX_ARTEFACT_BYTES} bytes",
-                hint="letters, digits, dot, dash and underscore",
-            )
-        self._folder.mkdir(parents=True, exist_ok=True)
-        (self._folder / name).write_bytes(data)
-        self._task.add_artefact(Artefact(name=name, media_type=media_type, size_bytes=len(data)))
-        return f"/v1/tasks/{self._task.id}/artefacts/{name}"
 
 
 Work = Callable[[TaskContext], Any]
@@ -137,6 +85,7 @@ class TaskStore:
         key: str | None = None,
         sub_lease: SubLease | None = None,
         client: str | None = None,
+        can_pause: bool = False,
     ) -> Task:
         """Queue a task; the same idempotency `key` with the same request returns the same task again.
 
@@ -151,6 +100,7 @@ class TaskStore:
                 return earlier
             self._check_room(client)
             task = Task(id=secrets.token_hex(8), verb=verb, request=request, moves=moves, holder=holder, key=key)
+            task.can_pause = can_pause
             task.by, task.sub_lease, task.client, task.on_change = actor(), sub_lease, client, self._changed
             self._tasks[task.id] = task
             forgotten = self._forget_old()
@@ -245,6 +195,42 @@ class TaskStore:
             )
         if task.state is TaskState.CANCELLING and task.moves:
             self._stop_until_ended(task)
+        return task
+
+    def pause(self, task_id: str) -> Task:
+        """Let a task stand still before its next step, until it is told to go on.
+
+        Raises:
+            NoSuchTask: there is no such task.
+            NotPossibleNow: it has ended, or has no steps between which it could stand still.
+            JournalError: the pause cannot be recorded.
+        """
+        task = self.get(task_id)
+        if task.state.is_final or not task.can_pause:
+            what = (
+                f"task {task_id} has {task.state}"
+                if task.state.is_final
+                else f"{task.verb} has no steps to pause between"
+            )
+            hint = "nothing to do" if task.state.is_final else "cancel it, or wait for its end"
+            raise NotPossibleNow(what, hint=hint, state=str(task.state))
+        if task.goes_on.is_set():
+            self._recorder.append("task-paused", {"task": task_id})
+            task.goes_on.clear()
+            task.add_event("state", detail="pause")
+        return task
+
+    def go_on(self, task_id: str) -> Task:
+        """Let a paused task go on; one that is not paused goes on anyway.
+
+        Raises:
+            NoSuchTask: there is no such task.
+            JournalError: it cannot be recorded.
+        """
+        task = self.get(task_id)
+        if not task.goes_on.is_set():
+            self._recorder.append("task-went-on", {"task": task_id})
+            task.goes_on.set()
         return task
 
     def cancel_moving(self, reason: str) -> None:

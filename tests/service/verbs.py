@@ -13,6 +13,7 @@ from hal.errors import DeviceTimeout, InvalidRequest
 from hal.motion import Hold
 from hal.strict import Strict
 from service.operations import Operation, OperationContext
+from service.operations.session import Session
 
 
 class EchoRequest(Strict):
@@ -72,6 +73,7 @@ def hold(context: OperationContext, request: HoldRequest) -> HoldResult:
     mover = context.connection.mover
     done_s = 0.0
     while done_s < request.seconds:
+        Session(context=context).begin_step("hold")
         context.task.progress(min(0.99, done_s / request.seconds), "holding")
         report = mover.execute(Hold(name="hold", duration_s=0.2))
         done_s += report.duration_s
@@ -120,6 +122,7 @@ OPERATIONS = {
             run=hold,
             summary="Hold",
             example={"seconds": 0.1},
+            can_pause=True,
         ),
         Operation(
             name="wait",

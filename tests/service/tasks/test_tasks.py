@@ -348,3 +348,45 @@ def test_a_used_key_with_another_request_is_refused(bench: Bench) -> None:
 
 def test_an_unknown_task_is_named() -> None:
     assert issubclass(NoSuchTask, CellError)
+
+
+def test_a_paused_task_stands_still_between_its_steps_until_it_goes_on(bench: Bench) -> None:
+    held = threading.Event()
+
+    def walk(context: TaskContext) -> str:
+        for _ in range(3):
+            context.pause_point(held.set)
+        while not context.is_cancelled and not held.is_set():
+            context.pause_point(held.set)
+        return "walked"
+
+    task = bench.store.start("walk", {}, walk, moves=True, can_pause=True)
+    assert bench.store.pause(bench.store.pause(task.id).id) is task, "a repeat is no error"
+    eventually(lambda: held.is_set() and task.pause == "held")
+    assert not task.state.is_final
+    bench.store.go_on(task.id)
+    assert task.wait(10.0)
+    assert (task.result, task.pause) == ("walked", "no")
+    kinds = [kind for kind, _ in bench.recorder.records]
+    assert kinds.count("task-paused") == kinds.count("task-went-on") == 1
+    with pytest.raises(NotPossibleNow, match="has succeeded"):
+        bench.store.pause(task.id)
+
+
+def test_a_paused_task_can_be_cancelled_and_one_without_steps_does_not_pause(bench: Bench) -> None:
+    task = bench.store.start("test", {}, _until_cancelled, moves=False)
+    with pytest.raises(NotPossibleNow, match="no steps"):
+        bench.store.pause(task.id)
+    bench.store.cancel(task.id)
+    paused = bench.store.start("test", {}, _until_held, moves=True, can_pause=True)
+    bench.store.pause(paused.id)
+    eventually(lambda: paused.pause == "held")
+    bench.store.cancel(paused.id)
+    assert paused.wait(10.0)
+    assert paused.state is S.CANCELLED
+
+
+def _until_held(context: TaskContext) -> None:
+    while True:
+        context.pause_point(lambda: None)
+        threading.Event().wait(0.001)

@@ -52,6 +52,7 @@ from service.http.session import LoginRequest
 from service.http.state import AppState
 from service.knowledge.teach import OutlineRequest, TeachRequest
 from service.readings import ReadingDesk
+from service.schema.requests import ReadPhotographRequest
 
 WEB = Path(__file__).parents[1] / "web"
 DESCRIPTION = f"""
@@ -158,6 +159,13 @@ def load_of_app(guarded: ASGIApp) -> Load:
     return guarded.load
 
 
+def document_of_app(guarded: ASGIApp) -> dict[str, Any]:
+    """Return the API document of an application that `create_app` made."""
+    assert isinstance(guarded, RequestGuard)  # noqa: S101 - narrowing: `create_app` returns a RequestGuard
+    document: dict[str, Any] = guarded.inner.openapi()
+    return document
+
+
 @contextlib.asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     state: AppState = app.state.panelwright
@@ -192,6 +200,7 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         SwapRequest,
         TakeOverRequest,
         OutlineRequest,
+        ReadPhotographRequest,
         TeachRequest,
         *alarms.BODIES,
         *limits.BODIES,

@@ -51,6 +51,7 @@ def install(place: Place) -> None:
                 live(ui.html("", sanitize=False).props("role=status"), lambda: _progress(mirror), of=mirror)
                 with ui.element("div").classes("row"):
                     end = button(say("missions.cancel"), desk.cancel, look="plain")
+                    hold = button(say("missions.pause"), desk.pause, look="plain")
                 live(ui.html("", sanitize=False), lambda: steps(mirror))
             with ui.element("section").classes("card"):
                 ui.html(say("missions.reports"), sanitize=False, tag="h2")
@@ -62,8 +63,14 @@ def install(place: Place) -> None:
                 live(ui.html("", sanitize=False), lambda: _tasks(mirror), of=mirror)
 
             def enable() -> None:
-                is_busy = mirror.active is not None
-                for one, is_on in [*((start, desk.can_run and not is_busy) for start in starts), (end, is_busy)]:
+                active = mirror.active
+                is_busy = active is not None
+                can_pause = active is not None and active["can_pause"] and mirror.may(Role.OPERATOR)
+                told = say("missions.pause" if active is None or active["pause"] == "no" else "missions.go_on")
+                if told != hold.content:
+                    hold.set_content(told)
+                run = [(start, desk.can_run and not is_busy) for start in starts]
+                for one, is_on in [*run, (end, is_busy), (hold, can_pause)]:
                     if is_on is bool(one.props.get("disabled")):
                         one.props(remove="disabled") if is_on else one.props("disabled")
 
@@ -120,6 +127,14 @@ class _Desk:
         if active is not None:
             await attempt(lambda: self._mirror.client.post(f"/v1/tasks/{active['id']}/cancel"))
             self._mirror.hurry()
+
+    async def pause(self) -> None:
+        """Let the task that runs stand still before its next step; one that is paused goes on."""
+        active = self._mirror.active
+        if active is not None:
+            deed = "pause" if active["pause"] == "no" else "go-on"
+            await attempt(lambda: self._mirror.client.post(f"/v1/tasks/{active['id']}/{deed}"))
+            await self._mirror.ask_now("tasks")
 
     def choices(self) -> str:
         """Return the mission files as buttons."""
@@ -192,7 +207,8 @@ def _progress(mirror: Mirror) -> str:
     request = task["request"]
     what = " ".join(part for part in (word("verb", task["verb"]), request.get("file") or request.get("resume")) if part)
     line = say("missions.running", what=what[:1].upper() + what[1:], percent=percent)
-    return f'<p>{attribute(line)}</p><div class="bar"><i style="width:{percent}%"></i></div>'
+    pause = {"asked": say("missions.pauses"), "held": say("missions.paused")}.get(task["pause"], "")
+    return f'<p>{attribute(line)} {attribute(pause)}</p><div class="bar"><i style="width:{percent}%"></i></div>'
 
 
 def steps(mirror: Mirror) -> str:

@@ -13,7 +13,6 @@ from hal.errors import DeviceTimeout, InvalidRequest
 from hal.motion import Hold
 from hal.strict import Strict
 from service.operations import Operation, OperationContext
-from service.operations.session import Session
 
 
 class EchoRequest(Strict):
@@ -73,7 +72,7 @@ def hold(context: OperationContext, request: HoldRequest) -> HoldResult:
     mover = context.connection.mover
     done_s = 0.0
     while done_s < request.seconds:
-        Session(context=context).begin_step("hold")
+        context.task.pause_point(lambda: mover.execute(Hold(name="pause", duration_s=0.1)))
         context.task.progress(min(0.99, done_s / request.seconds), "holding")
         report = mover.execute(Hold(name="hold", duration_s=0.2))
         done_s += report.duration_s

@@ -99,6 +99,7 @@ class Cell:
             run=mission,
             summary="Hold",
             moves=True,
+            can_pause=True,
             is_still=lambda request: request.dry_run,
         )
         sets = {

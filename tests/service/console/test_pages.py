@@ -55,6 +55,12 @@ def test_a_mission_is_chosen_planned_and_taken_up_where_it_ended(page: Any, cell
     page.click("button:text-is('Take up at “feel”')")
     until(page, "document.querySelector('.steps').textContent.includes('Reads from close up: SETPOINT')")
     assert cell.service.service.tasks.all()[0].request["resume"] == "20260103T000000-a"
+    page.click("button:text-is('Pause'):not([disabled])")
+    until(page, "document.querySelector('.main').textContent.includes('The arm stands still')")
+    assert cell.service.service.tasks.all()[0].pause == "held"
+    page.click("button:text-is('Go on'):not([disabled])")
+    until(page, "[...document.querySelectorAll('button')].some(one => one.textContent === 'Pause')")
+    assert cell.service.service.tasks.all()[0].pause == "no"
     page.click("button:text-is('Cancel'):not([disabled])")
     until(page, "document.querySelector('.steps').textContent.includes('cancelled')")
 

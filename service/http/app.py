@@ -122,7 +122,10 @@ def create_app(
 
 
 def _routers(service: Service) -> tuple[APIRouter, ...]:
+    """Return the routers; each request asks them in turn, so that those of frequent small requests come first."""
     return (
+        control.router,
+        health.router,
         verbs.router(dict(service.operations)),
         tasks.router,
         devices.router,
@@ -131,7 +134,6 @@ def _routers(service: Service) -> tuple[APIRouter, ...]:
         photographs.router,
         frames.router,
         calibrations.router,
-        control.router,
         mission_files.router,
         missions.router,
         history.router,
@@ -141,7 +143,6 @@ def _routers(service: Service) -> tuple[APIRouter, ...]:
         rounds.router,
         review.router,
         session.router,
-        health.router,
         stream.router,
     )
 

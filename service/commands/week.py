@@ -17,6 +17,7 @@ from service.commands.warm import compile_first
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from service.history.reading import StoredReading
     from service.plant import Plant
     from service.week.checks import Check
     from service.week.run import Lived
@@ -72,10 +73,11 @@ def run_week(cell: Path, seed: int | None, *, runs: Path, days: float, port: int
 
 
 def _line(lived: Lived, plant: Plant) -> str:
-    """Return a round in one line: its time, what the instruments truly showed, what it did, and the alarms."""
+    """Return a round in one line: its time, what it read, what it did, and the alarms."""
     from service.week.files import FLOW, PRESSURE, TEMPERATURE
 
-    words = [f"{name} {lived.truth[name]:.1f}" for name in (PRESSURE, FLOW, TEMPERATURE)]
+    read = {one.object: one for one in plant.history.newest() if one.task == lived.run.task}
+    words = [f"{name} {_shown(read.get(name))}" for name in (PRESSURE, FLOW, TEMPERATURE)]
     if lived.has_relieved:
         words.append("[bold]closed the valve[/]")
     if lived.run.why:
@@ -84,6 +86,15 @@ def _line(lived: Lived, plant: Plant) -> str:
     waiting, _ = plant.review.waiting(limit=1)
     words += [f"{waiting} waiting for review"] if waiting else []
     return f"{_time(lived.due_s)}  {', '.join(words)}"
+
+
+def _shown(reading: StoredReading | None) -> str:
+    """Return what a round read of one instrument."""
+    if reading is None:
+        return "[red]not read[/]"
+    if reading.value is None:
+        return "[yellow]refused[/]"
+    return f"{reading.value:.1f}"
 
 
 def _table(checks: Sequence[Check]) -> Table:

@@ -30,12 +30,18 @@ class Figure:
 def durable(given: argparse.Namespace) -> Figure:
     """Measure a reading until it is visible."""
     found = plant_service.durable(missions=given.missions, clients=given.clients)
-    p99, median = 1e3 * found.quantile_s(0.99), 1e3 * found.quantile_s(0.5)
+
+    def told(times_s: Sequence[float]) -> str:
+        return " / ".join(f"{1e3 * float(x):.1f}" for x in np.quantile(times_s, (0.5, 0.99)))
+
     says = (
-        f"a reading is durable and visible after {median:.1f} ms (median), {p99:.1f} ms (p99), {len(found.times_s)} readings in "
-        f"{found.missions} missions, {found.clients} clients of the feed, outlets: {', '.join(found.outlets)}"
+        f"a reading is on disk and a new question sees it after {told(found.stored_s)} ms (median / p99), the first of "
+        f"{found.clients} followers is told after {told(found.first_s)} ms, each of them after {told(found.each_s)} ms, of which "
+        f"the followers themselves cost {told(found.floor_s)} ms; {len(found.stored_s)} readings, {found.missions} missions, "
+        f"outlets: {', '.join(found.outlets)}"
     )
-    return Figure(says=says, line="p99 5 ms", holds=p99 <= 5.0)
+    p99_s = float(np.quantile(np.maximum(found.stored_s, found.first_s), 0.99))
+    return Figure(says=says, line="p99 5 ms until it is on disk, visible and told first", holds=p99_s <= 0.005)
 
 
 def trend(_given: argparse.Namespace) -> Figure:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import socket
@@ -10,15 +11,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-import numpy as np
-import tomlkit
-
+from benchmarks.stops import all_outlets, wait_for_outlets
 from hal.config import load_cell
 from service.commissioning.new_cell import copy_cell
 from service.history.reading import VALID, StoredReading
@@ -29,82 +27,169 @@ ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "cells/bench.toml"
 YEAR_H, OBJECTS, BUCKETS = 8760, 20, 200
 PROBE_S = 0.02  # between two probes
-CLIENTS = """
-import sys, threading
-import httpx2
-url, count = sys.argv[1], int(sys.argv[2])
-def follow():
-    with httpx2.Client(base_url=url, timeout=60.0, trust_env=False) as client:
-        while "readings_after" not in (found := client.get("/v1/feed").json()):
-            threading.Event().wait(0.5)  # the service is busy
-        at = {"readings_after": found["readings_after"], "alarms_after": found["alarms_after"]}
-        while True:
-            found = client.get("/v1/feed", params={**at, "wait_s": 30.0}).json()
-            at = {name: found.get(name, at[name]) for name in at}
-threads = [threading.Thread(target=follow, daemon=True) for _ in range(count)]
-for thread in threads:
-    thread.start()
-print("ready", flush=True)
-sys.stdin.read()
+FLOOR_PROBES = 200
+FOLLOWERS = """
+import json, selectors, socket, sys, time
+address, path, count = (sys.argv[1], int(sys.argv[2])), sys.argv[3], int(sys.argv[4])
+asked = f"GET {path} HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\n\\r\\n".encode()
+ready, rest, seen = selectors.DefaultSelector(), {}, {}
+for _ in range(count):
+    link = socket.create_connection(address)
+    link.sendall(asked)
+    ready.register(link, selectors.EVENT_READ)
+    rest[link] = b""
+started = set()
+ready.register(sys.stdin, selectors.EVENT_READ)
+while True:
+    for key, _ in ready.select():
+        if key.fileobj is sys.stdin:
+            print(json.dumps(seen), flush=True)
+            raise SystemExit
+        data = key.fileobj.recv(262144)
+        now_s = time.monotonic()
+        if not data:
+            raise SystemExit("the service ended a stream")
+        if key.fileobj not in started:
+            started.add(key.fileobj)
+            if len(started) == count:
+                print("ready", flush=True)
+        *events, rest[key.fileobj] = (rest[key.fileobj] + data).split(b"\\n\\n")
+        for event in events:
+            for part in event.split(b'"object":"probe"')[1:]:
+                number = part.split(b'"value":', 1)[1].split(b",", 1)[0].decode()
+                seen.setdefault(number, []).append(now_s)
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Durable:
-    """Times from a reading that is handed over until it is on disk and a new question sees it, s."""
+    """Times from a reading that is handed over, s.
 
-    times_s: tuple[float, ...]
+    Attributes:
+        stored_s: until it is on disk and a new question sees it.
+        first_s: until the first of the followers is told, over HTTP.
+        each_s: until a follower is told, one entry a follower.
+        floor_s: as `each_s`, from a server that does nothing but write to the followers, with nothing else running.
+    """
+
+    stored_s: tuple[float, ...]
+    first_s: tuple[float, ...]
+    each_s: tuple[float, ...]
+    floor_s: tuple[float, ...]
     missions: int
     clients: int
     outlets: tuple[str, ...]
 
-    def quantile_s(self, share: float) -> float:
-        """Return a quantile."""
-        return float(np.quantile(self.times_s, share))
-
 
 def durable(*, missions: int = 3, clients: int = 50, inline: bool = False) -> Durable:
-    """Measure with missions running, so many clients that follow the feed, and webhook and Prometheus outlets."""
-    with tempfile.TemporaryDirectory(prefix="panelwright-plant-") as folder, _receiver() as hook:
-        cell, outlets = _cell_with_outlets(Path(folder), hook)
-        panelwright = Panelwright(load_cell(cell), Options(port=0, runs_dir=Path(folder) / "runs", inline=inline))
+    """Measure with missions running, all outlets, and so many clients that follow the feed's events in another process."""
+    floor = _floor(clients)
+    with tempfile.TemporaryDirectory(prefix="panelwright-plant-") as folder, all_outlets() as outlets:
+        cell = load_cell(copy_cell(BENCH, Path(folder) / "plant").cell)
+        cell = cell.model_copy(update={"file": cell.file.model_copy(update={"outlets": outlets})})
+        panelwright = Panelwright(cell, Options(port=0, runs_dir=Path(folder) / "runs", inline=inline))
         try:
             panelwright.start()
-            command = [sys.executable, "-P", "-c", CLIENTS, panelwright.url, str(clients)]
-            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as followers:
-                assert followers.stdout is not None
-                assert followers.stdout.readline().strip() == "ready"
-                try:
-                    times = _probed(panelwright, missions)
-                finally:
-                    followers.kill()
+            if not inline:
+                wait_for_outlets(outlets)
+            port = int(panelwright.url.rsplit(":", 1)[1])
+            with _followers(port, "/v1/feed/events", clients) as told:
+                begun_s, stored_s = _probed(panelwright, missions)
+                seen = told()
         finally:
             panelwright.close()
-    return Durable(times_s=tuple(times), missions=missions, clients=clients, outlets=outlets)
+    each = _delays(begun_s, seen, clients)
+    return Durable(
+        stored_s=tuple(stored_s),
+        first_s=tuple(min(one) for one in each),
+        each_s=tuple(x for one in each for x in one),
+        floor_s=floor,
+        missions=missions,
+        clients=clients,
+        outlets=tuple(outlets.model_dump(exclude_none=True)),
+    )
 
 
-def _probed(panelwright: Panelwright, missions: int) -> list[float]:
-    """Return the times of probes while missions run one after the other."""
+@contextmanager
+def _followers(port: int, path: str, count: int) -> Iterator[Callable[[], dict[str, list[float]]]]:
+    """Follow events in a process of its own; yields what ends it and returns when each probe was seen, by its number."""
+    command = [sys.executable, "-P", "-c", FOLLOWERS, "127.0.0.1", str(port), path, str(count)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None and process.stdout is not None
+
+        def told() -> dict[str, list[float]]:
+            time.sleep(1.0)  # the last event is on its way
+            process.stdin.write("end\n")  # type: ignore[union-attr]  # asserted above
+            process.stdin.flush()  # type: ignore[union-attr]
+            found: dict[str, list[float]] = json.loads(process.stdout.readline())  # type: ignore[union-attr]
+            return found
+
+        try:
+            if process.stdout.readline().strip() != "ready":
+                raise RuntimeError("the followers cannot follow")
+            yield told
+        finally:
+            process.kill()
+
+
+def _delays(begun_s: list[float], seen: dict[str, list[float]], clients: int) -> list[list[float]]:
+    """Return the delays of each probe; every follower must have seen every one, once."""
+    at = {float(number): times for number, times in seen.items()}
+    found = [at.get(float(number), []) for number in range(len(begun_s))]
+    lacking = [number for number, times in enumerate(found) if len(times) != clients]
+    if lacking:
+        raise AssertionError(f"{len(lacking)} readings were not told to each follower once; the first is {lacking[0]}")
+    return [[time_s - begun for time_s in times] for begun, times in zip(begun_s, found, strict=True)]
+
+
+def _floor(clients: int) -> tuple[float, ...]:
+    """Return what the followers themselves cost: times from writing an event to each of them until it is seen."""
+    begun_s, links = list[float](), list[socket.socket]()
+    with socket.create_server(("127.0.0.1", 0), backlog=clients) as server:
+
+        def serve(end: threading.Event) -> None:
+            links.extend(server.accept()[0] for _ in range(clients))
+            for link in links:
+                link.sendall(b"HTTP/1.1 200 OK\r\n\r\n:\n\n")
+            end.wait(0.5)
+            for number in range(FLOOR_PROBES):
+                event = b'data: {"object":"probe","value":%d.0,%b}\n\n' % (number, b" " * 700)
+                begun_s.append(time.monotonic())
+                for link in links:
+                    link.sendall(event)
+                end.wait(PROBE_S)
+            end.set()
+
+        end = threading.Event()
+        threading.Thread(target=serve, args=(end,), daemon=True).start()
+        with _followers(server.getsockname()[1], "/", clients) as told:
+            end.wait()
+            return tuple(x for one in _delays(begun_s, told(), clients) for x in one)
+
+
+def _probed(panelwright: Panelwright, missions: int) -> tuple[list[float], list[float]]:
+    """Return when each probe began, and how long it took to be stored, while missions run one after the other."""
     service, plant = panelwright.service, panelwright.service.plant
     request = service.operations["missions"].request_model.model_validate({"file": "inspect"})
-    reader, times, pause = plant.history.reader(), list[float](), threading.Event()
+    reader, begun, stored, pause = plant.history.reader(), list[float](), list[float](), threading.Event()
     for _ in range(missions):
         task = service.submit("missions", request)
         while not task.state.is_final:
-            number = len(times)
+            number = len(begun)
             one = _reading("probe", time.time(), float(number))
-            begun_s = time.perf_counter()
+            begun.append(time.monotonic())
             plant.history.add([one])
             for listen in plant.observations.listeners:
                 listen([one])
-            seen = reader.page(plant.history.ask(object="probe"), after=reader.newest_id() - 1, limit=5)
-            times.append(time.perf_counter() - begun_s)
-            if not any(row.reading.value == float(number) for row in seen):
+            newest = reader.page(plant.history.ask(object="probe"), after=reader.newest_id() - 20, limit=20)
+            stored.append(time.monotonic() - begun[-1])
+            if not any(row.reading.value == float(number) for row in newest):
                 raise AssertionError(f"reading {number} is not visible after it was stored")
             pause.wait(PROBE_S)
         if task.problem is not None:
-            raise AssertionError(f"the mission has failed: {task.problem['detail']}")
-    return times
+            why = service.supervisor.latch.state().source
+            raise AssertionError(f"the mission has failed: {task.problem['detail']} (newest stop: {why})")
+    return begun, stored
 
 
 def _reading(name: str, utc_s: float, value: float) -> StoredReading:
@@ -112,49 +197,6 @@ def _reading(name: str, utc_s: float, value: float) -> StoredReading:
         object=name, kind="gauge", utc_s=utc_s, cell_s=0.0, quality=VALID, value=value, unit="bar", sigma=0.02,
         confidence=0.9, verb="missions", task="t", mission="m",
     )  # fmt: skip
-
-
-def _cell_with_outlets(folder: Path, hook: str) -> tuple[Path, tuple[str, ...]]:
-    """Return the bench cell with limits and outlets, and the names of the outlets."""
-    copied = copy_cell(BENCH, folder / "plant")
-    document = tomlkit.parse(copied.cell.read_text(encoding="utf-8"))
-    (folder / "plant/cells/hook.secret").write_text("0123456789abcdef0123456789abcdef\n")
-    (folder / "plant/cells/hook.secret").chmod(0o600)
-    outlets: dict[str, dict[str, object]] = {
-        "webhook": {"url": hook, "secret_file": "hook.secret", "events": ["alarms", "readings"]},
-        "prometheus": {"port": _free_port()},
-    }
-    document["outlets"] = outlets
-    copied.cell.write_text(tomlkit.dumps(document), encoding="utf-8")
-    return copied.cell, tuple(outlets)
-
-
-def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
-
-
-@contextmanager
-def _receiver() -> Iterator[str]:
-    """Yield the address of a webhook that takes everything."""
-
-    class Taker(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            self.send_response(204)
-            self.end_headers()
-
-        def log_message(self, *_given: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Taker)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}/"
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 def trend(*, hours: int = YEAR_H, objects: int = OBJECTS) -> list[float]:

@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"|{' --- |' * 9}", flush=True)
     prefix = REALTIME if given.realtime else ()
     with (
-        _outlets() if given.outlets else contextlib.nullcontext(OutletsSection()) as outlets,
+        all_outlets() if given.outlets else contextlib.nullcontext(OutletsSection()) as outlets,
         _served(given.cell, outlets) as served,
         control_probe(served.folder / LATCH, rate_hz=CONTROL_HZ, prefix=prefix) as probe,
     ):
@@ -258,7 +258,7 @@ def _free_port() -> int:
 
 
 @contextmanager
-def _outlets() -> Iterator[OutletsSection]:
+def all_outlets() -> Iterator[OutletsSection]:
     """Start a broker; yields a section with all outlets on. The webhook's far side answers nothing, so it tries again and again."""
     mosquitto = shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin:/usr/bin:/bin")
     if mosquitto is None:
@@ -271,19 +271,21 @@ def _outlets() -> Iterator[OutletsSection]:
         secret = Path(folder) / "secret"
         secret.write_text("of a benchmark")
         secret.chmod(0o600)
-        yield OutletsSection(
-            mqtt=MqttSection(host="127.0.0.1", port=port),
-            sparkplug=SparkplugSection(host="127.0.0.1", port=port, group="plant"),
-            webhook=WebhookSection(
-                url=f"http://127.0.0.1:{_free_port()}/", secret_file=str(secret), events=("alarms", "readings")
-            ),
-            prometheus=PrometheusSection(port=_free_port()),
-            opcua=OpcuaSection(port=_free_port()),
-        )
-        broker.terminate()
+        try:
+            yield OutletsSection(
+                mqtt=MqttSection(host="127.0.0.1", port=port),
+                sparkplug=SparkplugSection(host="127.0.0.1", port=port, group="plant"),
+                webhook=WebhookSection(
+                    url=f"http://127.0.0.1:{_free_port()}/", secret_file=str(secret), events=("alarms", "readings")
+                ),
+                prometheus=PrometheusSection(port=_free_port()),
+                opcua=OpcuaSection(port=_free_port()),
+            )
+        finally:
+            broker.terminate()
 
 
-def _wait_for(outlets: OutletsSection) -> None:
+def wait_for_outlets(outlets: OutletsSection) -> None:
     """Wait until the servers among the outlets answer."""
     for section in (outlets.prometheus, outlets.opcua):
         end_s = time.monotonic() + 120.0
@@ -312,7 +314,7 @@ def _served(cell: Path, outlets: OutletsSection) -> Iterator[Served]:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None and process.stdin is not None
             url, stop_port, console_url, folder = process.stdout.readline().split()
-            _wait_for(outlets)
+            wait_for_outlets(outlets)
             with Latch(Path(folder) / LATCH) as latch:
                 yield Served(
                     url=url, stop_port=int(stop_port), console_url=console_url, folder=Path(folder), latch=latch

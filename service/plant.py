@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,8 @@ class Plant:
         self._journal, self._commit = journal, commit
         self.limits = LimitBook(state_dir / "limits.json")
         self.changes = 0  # rises with each reading and each change of an alarm
+        self.listeners: list[Callable[[], None]] = []  # told of each, in the thread that made it
+        self._alarm_changes = deque(self._recorded_alarms(), maxlen=RESTORED_ALARMS)
         self.alarms = self._open_alarms(state_dir / "alarms.json")
         self.review = ReviewDesk(self.history, cell.panel, cell=cell.name, commit=commit, now_s=self._now_s)
         asked = cell.file.review
@@ -63,7 +66,7 @@ class Plant:
         self._certificate = Certificate(cell.certificate_path, panel=cell.panel.name, sure_at=asked.sure_at)
         self.observations = Observations(
             history=self.history,
-            listeners=[self.alarms.take, self._note_change],
+            listeners=[self._note_change, self.alarms.take],  # who follows the feed need not wait for the journal
             doubt_of=doubts.of,
             certify=self._certify,
             alarms=self._active_alarms,
@@ -149,7 +152,7 @@ class Plant:
 
     def alarm_changes(self, after: int) -> list[dict[str, Any]]:
         """Return the changes of alarms with a greater number, oldest first; at most the newest thousand."""
-        wanted = (data for data in self._recorded_alarms() if data.get("number", 0) > after)
+        wanted = (data for data in list(self._alarm_changes) if data.get("number", 0) > after)
         return [{"key_name": None, **data, "id": f"{data['object']}.{data['kind']}"} for data in wanted]
 
     def _recorded_alarms(self) -> list[dict[str, Any]]:
@@ -157,10 +160,13 @@ class Plant:
 
     def _commit_alarm(self, kind: str, data: dict[str, Any]) -> None:
         self._commit(kind, data)
+        self._alarm_changes.append(data)
         self._note_change()
 
     def _note_change(self, _readings: Sequence[StoredReading] = ()) -> None:
         self.changes += 1
+        for tell in self.listeners:
+            tell()
 
     def _certify(self, reading: StoredReading, crop: bytes | None) -> str:
         return self._certificate.of(reading.kind, crop, is_sure=reading.is_sure)
@@ -194,7 +200,7 @@ class Plant:
             self.panel,
             path=path,
             commit=self._commit_alarm,
-            recorded=self._recorded_alarms(),
+            recorded=list(self._alarm_changes),
             valid_at_s=reader.valid_at_s(self._cell.name, names),
             now_s=self._calendar,
         )

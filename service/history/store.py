@@ -61,6 +61,7 @@ class History:
         self._cell, self._panel, self._now_s = cell, panel, now_s
         self._lock = threading.Lock()
         self._adds, self._trimmed_s = 0, float("-inf")
+        self.version = 0  # rises with all that is stored
         self._db, aside = open_history(self.path)
         self.set_aside_now = aside
         if aside is not None:
@@ -97,6 +98,7 @@ class History:
                     raise cannot_write(self.path, error) from error
                 self._begin_anew()
                 self._retry(rows)
+            self.version += 1
         self._trim_if_due()
 
     def answer(self, reading_id: int, *, said: str, value: float | None, state: str | None, text: str | None) -> Row:
@@ -118,6 +120,7 @@ class History:
                     "WHERE id = ? AND cell = ? AND doubt != '' AND answered IS NULL",
                     (said, value, state, text, reading_id, self._cell),
                 ).rowcount
+                self.version += 1
             except sqlite3.Error as error:
                 raise cannot_write(self.path, error) from error
         found = self.row(reading_id)

@@ -109,6 +109,7 @@ def create_app(
     )
     app.state.panelwright = state
     app.state.sampler = stream.Sampler(state)
+    app.state.feed = feed.FeedDesk()
     routers = _routers(service)
     for router in routers:
         app.include_router(router)
@@ -171,10 +172,12 @@ def document_of_app(guarded: ASGIApp) -> dict[str, Any]:
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     state: AppState = app.state.panelwright
     state.hub.open(state.service.tasks)
+    app.state.feed.open(state.hub, state.service.plant)
     probe = asyncio.create_task(state.metrics.probe_lag())
     yield
     probe.cancel()
     state.hub.close()
+    app.state.feed.release()
     for pool in (state.pool, state.control_pool, state.stop_pool):
         pool.shutdown(wait=False, cancel_futures=True)
 

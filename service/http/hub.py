@@ -18,6 +18,7 @@ class Hub:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._unsubscribe: Callable[[], None] = lambda: None
         self.is_closing = False
+        self.on_close: list[Callable[[], None]] = []  # called from any thread
 
     def open(self, tasks: TaskStore) -> None:
         """Subscribe to the tasks; call it inside the event loop."""
@@ -29,6 +30,8 @@ class Hub:
         self.is_closing = True
         self._unsubscribe()
         self._call(self._wake)
+        for tell in self.on_close:
+            tell()
 
     @contextmanager
     def watch(self) -> Iterator[asyncio.Event]:

@@ -73,6 +73,7 @@ TABLE: dict[str, Row] = {
     "GET /v1/alarms": OBSERVER,
     "GET /v1/limits": OBSERVER,
     "GET /v1/feed": OBSERVER,
+    "GET /v1/feed/events": OBSERVER,
     "GET /v1/review": OBSERVER,
     "GET /v1/rounds": OBSERVER,
     "GET /v1/rounds/{round}/runs": OBSERVER,

@@ -160,7 +160,8 @@ def asked(http: httpx2.Client, call: str, headers: dict[str, str]) -> int:
         return socket_status(http, headers)
     if call.endswith("/events"):
         path = path.replace("none", "no-such-task")
-    return http.request(method, path, content=content, headers={**headers, "Content-Type": media}).status_code
+    with http.stream(method, path, content=content, headers={**headers, "Content-Type": media}) as answer:
+        return answer.status_code  # the feed's events never end
 
 
 def socket_status(http: httpx2.Client, headers: dict[str, str]) -> int:

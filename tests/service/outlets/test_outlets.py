@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +26,14 @@ from hal.outlets import MqttSection, OutletsSection, PrometheusSection, WebhookS
 from service.access.keys import Role
 from service.client import ApiError
 from service.commissioning.outlets import checked_outlets
+from service.http import feed as feed_module
+from service.http.feed import Found, Place
 from service.outlets.api import ApiSource
-from service.outlets.process import outlets_of
+from service.outlets.process import outlets_of, run
 from service.outlets.prometheus import PrometheusOutlet
 from service.outlets.source import Cursor, CursorFile
 from service.outlets.webhook import WebhookOutlet, signature_of
+from service.plant import Plant
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
 from tests.service.history.test_store import reading
@@ -144,12 +150,52 @@ def test_prometheus_gets_values_states_and_alarms_and_nothing_old(tmp_path: Path
 def test_only_what_the_cell_file_asks_for_is_imported(tmp_path: Path) -> None:
     code = (
         "import sys, pathlib; from service.outlets.process import outlets_of; from hal.outlets import *; "
-        "outlets_of(OutletsSection(prometheus=PrometheusSection()), cell='a', source=None, folder=pathlib.Path()); "
+        "outlets_of(OutletsSection(prometheus=PrometheusSection()), cell='a', source=None, folder=pathlib.Path())['prometheus'](); "
         "print(sorted({'aiomqtt', 'paho', 'scipy', 'fastapi'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
-    assert outlets_of(OutletsSection(), cell="a", source=FakeSource(), folder=tmp_path) == []
+    assert outlets_of(OutletsSection(), cell="a", source=FakeSource(), folder=tmp_path) == {}
+
+
+def test_an_outlet_that_fails_is_made_anew_and_disturbs_no_other() -> None:
+    made = dict.fromkeys(("broken", "unmade", "ends", "sound"), 0)
+    pauses: list[float] = []
+
+    class Fake:
+        def __init__(self, name: str) -> None:
+            self._name = name
+
+        async def run(self) -> None:
+            if self._name == "broken":
+                raise KeyError("a defect")
+            if self._name == "sound":
+                await asyncio.Event().wait()
+
+    def make(name: str) -> Fake:
+        made[name] += 1
+        if name == "unmade":
+            raise OSError("the file with its password cannot be read")
+        return Fake(name)
+
+    async def story() -> None:
+        over = asyncio.Event()
+
+        async def sleep(pause_s: float) -> None:
+            pauses.append(pause_s)
+            if min(made[name] for name in made if name != "sound") == 4:
+                over.set()
+            await asyncio.sleep(0)
+
+        outlets = {name: functools.partial(make, name) for name in made}
+        gateway = asyncio.create_task(run(outlets, sleep=sleep))
+        await over.wait()
+        assert not gateway.done()
+        gateway.cancel()
+
+    asyncio.run(story())
+    assert made["sound"] == 1, "it was never restarted"
+    assert pauses[:9] == [1.0] * 3 + [2.0] * 3 + [5.0] * 3, "each has pauses of its own, which grow"
 
 
 @pytest.mark.parametrize(
@@ -206,6 +252,69 @@ def test_the_feed_tells_what_has_come_since_in_order(served: Panelwright, client
         client.get("/v1/feed?readings_after=999999&alarms_after=0").json()["readings_after"] == found["readings_after"]
     )
     plant.alarms.acknowledge("pump_lamp.state", by="cleaner")
+
+
+def test_those_who_wait_for_the_feed_share_one_look_and_hold_up_no_read(
+    served: Panelwright, client: httpx2.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant, looks, waiting = served.service.plant, list[Place](), 60
+    look, has_looked = feed_module._found, threading.Event()
+
+    def counted(of: Plant, place: Place) -> Found:
+        looks.append(place)
+        if place.readings_after is not None:
+            has_looked.set()
+        return look(of, place)
+
+    monkeypatch.setattr(feed_module, "_found", counted)
+    start = client.get("/v1/feed").json()
+    asked = f"/v1/feed?readings_after={start['readings_after']}&alarms_after={start['alarms_after']}&wait_s=30"
+    known = Place(start["readings_after"], start["alarms_after"])
+
+    async def story() -> list[bytes]:
+        limits = httpx2.Limits(max_connections=waiting + 1)
+        async with httpx2.AsyncClient(base_url=served.url, trust_env=False, timeout=60.0, limits=limits) as many:
+            held = [asyncio.create_task(many.get(asked)) for _ in range(waiting)]
+            await asyncio.to_thread(has_looked.wait)
+            assert (await many.get("/v1/history")).status_code == 200, "more wait than reads may wait at once"
+            plant.history.add([reading(0, 7.5)])
+            plant.observations.listeners[0]([])
+            return [answer.content for answer in await asyncio.gather(*held)]
+
+    answers = asyncio.run(story())
+    assert len(answers) == waiting and len(set(answers)) == 1
+    assert [one["value"] for one in json.loads(answers[0])["readings"]] == [7.5]
+    assert looks.count(known) <= 3, "one before the reading, one after it"
+
+
+def test_the_feed_streams_what_comes_and_goes_on_after_the_last_event(
+    served: Panelwright, client: httpx2.Client
+) -> None:
+    plant = served.service.plant
+
+    def events(lines: Iterator[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+        number = ""
+        for line in lines:
+            if line.startswith("id: "):
+                number = line[4:]
+            elif line.startswith("data: "):
+                yield number, json.loads(line[6:])
+
+    with client.stream("GET", "/v1/feed/events") as answer:
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        found = events(answer.iter_lines())
+        last, first = next(found)
+        assert (first["readings"], first["alarms"]) == ([], [])
+        for value in (1.5, 2.5):
+            plant.history.add([reading(0, value)])
+            plant.observations.listeners[0]([])
+            told, body = next(found)
+            assert [one["value"] for one in body["readings"]] == [value]
+            assert told == f"{body['readings_after']}-{body['alarms_after']}"
+    with client.stream("GET", "/v1/feed/events", headers={"Last-Event-ID": last}) as answer:
+        _, body = next(events(answer.iter_lines()))
+        assert [one["value"] for one in body["readings"]] == [1.5, 2.5]
+    assert client.get("/v1/feed/events", headers={"Last-Event-ID": "yesterday"}).status_code == 422
 
 
 def test_an_outlet_knows_the_panel_and_acknowledges_what_the_service_allows(served: Panelwright) -> None:

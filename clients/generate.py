@@ -95,7 +95,7 @@ def without_named_choices(document: Schema) -> Schema:
 
 def calls_of(document: Schema) -> Iterator[tuple[str, str, Schema]]:
     """Yield method, path and operation of each call; the event stream is not one, because it has no end."""
-    for path, operations in document["paths"].items():
+    for path, operations in sorted(document["paths"].items()):  # routers may change their order
         for method, operation in operations.items():
             if "text/event-stream" not in _answers(operation):
                 yield method.upper(), path, operation

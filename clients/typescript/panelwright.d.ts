@@ -2905,6 +2905,88 @@ export type operations = Record<string, never>;
 
 /** The calls of the API by method and path: the body that each takes, its query, and its answer. */
 export interface Calls {
+  /** Whether the service answers */
+  "GET /healthz": { body: never; query: never; answer: HealthzView };
+  /** Prometheus metrics */
+  "GET /metrics": { body: never; query: never; answer: Blob };
+  /** Whether the cell is ready, and for what */
+  "GET /readyz": { body: never; query: never; answer: ReadyView };
+  /** Alarms, those that need a person first */
+  "GET /v1/alarms": { body: never; query: { all?: boolean }; answer: AlarmList };
+  /** Say that a person has seen it */
+  "POST /v1/alarms/{alarm}/acknowledge": { body: AcknowledgeRequest; query: never; answer: AlarmView };
+  /** Put it back in service */
+  "POST /v1/alarms/{alarm}/in-service": { body: AcknowledgeRequest; query: never; answer: AlarmView };
+  /** Take it out of service */
+  "POST /v1/alarms/{alarm}/out-of-service": { body: ServiceRequest; query: never; answer: AlarmView };
+  /** Shelve it until a time */
+  "POST /v1/alarms/{alarm}/shelve": { body: ShelveRequest; query: never; answer: AlarmView };
+  /** End its shelving */
+  "POST /v1/alarms/{alarm}/unshelve": { body: AcknowledgeRequest; query: never; answer: AlarmView };
+  /** Calibrate camera, hand-eye, range scanner or tool; the arm drives through poses, and the record is stored */
+  "POST /v1/calibrations": { body: CalibrationRequest; query: { wait_s?: number }; answer: CalibrationTask };
+  /** Calibrations in use */
+  "GET /v1/calibrations": { body: never; query: { toml?: boolean }; answer: CalibrationList };
+  /** The calibration of one device, with its TOML */
+  "GET /v1/calibrations/{name}": { body: never; query: never; answer: CalibrationView };
+  /** Use the cell file's own record again; the measured one is kept among the older ones */
+  "DELETE /v1/calibrations/{name}": { body: never; query: never; answer: null };
+  /** All devices with their health */
+  "GET /v1/devices": { body: never; query: never; answer: DeviceList };
+  /** One device with capabilities and mount */
+  "GET /v1/devices/{name}": { body: never; query: never; answer: DeviceDetail };
+  /** Replace a device's driver or options while the cell runs */
+  "PUT /v1/devices/{name}": { body: SwapRequest; query: never; answer: DeviceDetail };
+  /** Connect a device again with its present driver and options */
+  "POST /v1/devices/{name}/connect": { body: never; query: never; answer: DeviceDetail };
+  /** Inject a fault into a simulated device, or end it */
+  "POST /v1/devices/{name}/fault": { body: FaultRequest; query: never; answer: DeviceView };
+  /** The newest reading: JSON, or PNG and npz for images and ranges */
+  "GET /v1/devices/{name}/reading": { body: never; query: { format?: "json" | "png" | "npz"; max_age_s?: number }; answer: ReadingView };
+  /** Readings and changes of alarms since the last call */
+  "GET /v1/feed": { body: never; query: { readings_after?: number | null; alarms_after?: number | null; wait_s?: number }; answer: Feed };
+  /** Poses of the devices, the flange and the panel */
+  "GET /v1/frames": { body: never; query: never; answer: FrameList };
+  /** Fuse measurements of nine kinds into one pose, or collect them first */
+  "POST /v1/fuse": { body: FuseRequest; query: { wait_s?: number }; answer: FuseTask };
+  /** Newest reading of each object */
+  "GET /v1/history": { body: never; query: never; answer: HistoryOverview };
+  /** Readings as a file: CSV, or Parquet with the extra `history` */
+  "GET /v1/history/export": { body: never; query: { format?: "csv" | "parquet"; object?: string | null; since_s?: number | null; until_s?: number | null }; answer: Blob };
+  /** Readings of one object: pages, or a trend */
+  "GET /v1/history/{object}": { body: never; query: { since_s?: number | null; until_s?: number | null; after?: number; limit?: number; buckets?: number }; answer: HistoryPage };
+  /** The picture of an object at a reading */
+  "GET /v1/history/{object}/crops/{crop}": { body: never; query: never; answer: Blob };
+  /** Stored images, newest first */
+  "GET /v1/images": { body: never; query: never; answer: ImageList };
+  /** Store a PNG, JPEG or BMP */
+  "POST /v1/images": { body: Blob; query: never; answer: ImageView };
+  /** The image itself */
+  "GET /v1/images/{image_id}": { body: never; query: never; answer: Blob };
+  /** Delete a stored image */
+  "DELETE /v1/images/{image_id}": { body: never; query: never; answer: null };
+  /** What this is */
+  "GET /v1/info": { body: never; query: never; answer: InfoView };
+  /** Read instruments, lamps, switches and valves from close up */
+  "POST /v1/inspect": { body: InspectRequest; query: { wait_s?: number }; answer: InspectTask };
+  /** Compare a finished mission with the simulator's truth (simulated cells only) */
+  "POST /v1/judge": { body: EvaluateRequest; query: { wait_s?: number }; answer: EvaluateTask };
+  /** Kinds, objects and panels, with their TOML */
+  "GET /v1/knowledge": { body: never; query: { toml?: boolean }; answer: KnowledgeView };
+  /** One kind, with its TOML */
+  "GET /v1/knowledge/kinds/{name}": { body: never; query: never; answer: KindView };
+  /** Find the object at one to three clicks in a stored image; writes nothing */
+  "POST /v1/knowledge/outline": { body: OutlineRequest; query: never; answer: OutlineView };
+  /** One panel, with its TOML */
+  "GET /v1/knowledge/panels/{name}": { body: never; query: never; answer: PanelView };
+  /** Questions of the dialogue about an object of a kind */
+  "GET /v1/knowledge/questions": { body: never; query: { kind?: string }; answer: QuestionList };
+  /** Teach a kind by clicks, or a whole panel by clicks and answers */
+  "POST /v1/knowledge/teach": { body: TeachRequest; query: never; answer: TaughtView };
+  /** Forget a taught kind or panel */
+  "DELETE /v1/knowledge/{group}/{name}": { body: never; query: never; answer: null };
+  /** Learn what the objects of the located panel look like, for blind recognition */
+  "POST /v1/learn": { body: LearnRequest; query: { wait_s?: number }; answer: LearnTask };
   /** Who may move */
   "GET /v1/lease": { body: never; query: never; answer: LeaseView };
   /** Take the free lease */
@@ -2915,146 +2997,64 @@ export interface Calls {
   "POST /v1/lease/release": { body: never; query: never; answer: LeaseView };
   /** Take the lease from its holder; the tasks of that holder are stopped */
   "POST /v1/lease/take-over": { body: TakeOverRequest; query: never; answer: GrantView };
-  /** State of the software stop */
-  "GET /v1/stop": { body: never; query: never; answer: StopView };
-  /** Stop the arm; anybody may do this at any time, without a body */
-  "POST /v1/stop": { body: never; query: never; answer: StopView };
-  /** Clear the stop; this alone moves nothing */
-  "POST /v1/stop/reset": { body: ResetRequest; query: never; answer: StopView };
-  /** Whether the service answers */
-  "GET /healthz": { body: never; query: never; answer: HealthzView };
-  /** Whether the cell is ready, and for what */
-  "GET /readyz": { body: never; query: never; answer: ReadyView };
-  /** Prometheus metrics */
-  "GET /metrics": { body: never; query: never; answer: Blob };
-  /** What this is */
-  "GET /v1/info": { body: never; query: never; answer: InfoView };
-  /** Locate the panel by lights, tags, outline or looks; the answer is its pose with covariance */
-  "POST /v1/panel-pose": { body: PanelPoseRequest; query: { wait_s?: number }; answer: PanelPoseTask };
-  /** Find the panel's objects in the camera's image or surfaces in the range image */
-  "POST /v1/recognise": { body: RecogniseRequest; query: { wait_s?: number }; answer: RecogniseTask };
-  /** Learn what the objects of the located panel look like, for blind recognition */
-  "POST /v1/learn": { body: LearnRequest; query: { wait_s?: number }; answer: LearnTask };
-  /** Read instruments, lamps, switches and valves from close up */
-  "POST /v1/inspect": { body: InspectRequest; query: { wait_s?: number }; answer: InspectTask };
-  /** Fuse measurements of nine kinds into one pose, or collect them first */
-  "POST /v1/fuse": { body: FuseRequest; query: { wait_s?: number }; answer: FuseTask };
-  /** Operate one control and read back whether it reached its target */
-  "POST /v1/manipulate": { body: ManipulateRequest; query: { wait_s?: number }; answer: ManipulateTask };
-  /** Run a mission and write its report; without a mission, inspect and touch nothing */
-  "POST /v1/missions": { body: MissionRequest; query: { wait_s?: number }; answer: MissionTask };
-  /** Missions with reports, newest first */
-  "GET /v1/missions": { body: never; query: never; answer: MissionList };
-  /** Calibrate camera, hand-eye, range scanner or tool; the arm drives through poses, and the record is stored */
-  "POST /v1/calibrations": { body: CalibrationRequest; query: { wait_s?: number }; answer: CalibrationTask };
-  /** Calibrations in use */
-  "GET /v1/calibrations": { body: never; query: { toml?: boolean }; answer: CalibrationList };
-  /** Compare a finished mission with the simulator's truth (simulated cells only) */
-  "POST /v1/judge": { body: EvaluateRequest; query: { wait_s?: number }; answer: EvaluateTask };
-  /** Kept tasks, newest first */
-  "GET /v1/tasks": { body: never; query: { state?: "queued" | "running" | "cancelling" | "succeeded" | "failed" | "cancelled" | null; limit?: number }; answer: TaskList };
-  /** One task */
-  "GET /v1/tasks/{task_id}": { body: never; query: { wait_s?: number }; answer: TaskView };
-  /** Stop the arm, then end the task */
-  "POST /v1/tasks/{task_id}/cancel": { body: never; query: { wait_s?: number }; answer: TaskView };
-  /** Stand still before the next step of a mission */
-  "POST /v1/tasks/{task_id}/pause": { body: never; query: never; answer: TaskView };
-  /** Let a paused mission go on */
-  "POST /v1/tasks/{task_id}/go-on": { body: never; query: never; answer: TaskView };
-  /** A file that the task produced */
-  "GET /v1/tasks/{task_id}/artefacts/{name}": { body: never; query: never; answer: Blob };
-  /** All devices with their health */
-  "GET /v1/devices": { body: never; query: never; answer: DeviceList };
-  /** One device with capabilities and mount */
-  "GET /v1/devices/{name}": { body: never; query: never; answer: DeviceDetail };
-  /** Replace a device's driver or options while the cell runs */
-  "PUT /v1/devices/{name}": { body: SwapRequest; query: never; answer: DeviceDetail };
-  /** The newest reading: JSON, or PNG and npz for images and ranges */
-  "GET /v1/devices/{name}/reading": { body: never; query: { format?: "json" | "png" | "npz"; max_age_s?: number }; answer: ReadingView };
-  /** Connect a device again with its present driver and options */
-  "POST /v1/devices/{name}/connect": { body: never; query: never; answer: DeviceDetail };
-  /** Inject a fault into a simulated device, or end it */
-  "POST /v1/devices/{name}/fault": { body: FaultRequest; query: never; answer: DeviceView };
-  /** Kinds, objects and panels, with their TOML */
-  "GET /v1/knowledge": { body: never; query: { toml?: boolean }; answer: KnowledgeView };
-  /** Questions of the dialogue about an object of a kind */
-  "GET /v1/knowledge/questions": { body: never; query: { kind?: string }; answer: QuestionList };
-  /** Find the object at one to three clicks in a stored image; writes nothing */
-  "POST /v1/knowledge/outline": { body: OutlineRequest; query: never; answer: OutlineView };
-  /** Teach a kind by clicks, or a whole panel by clicks and answers */
-  "POST /v1/knowledge/teach": { body: TeachRequest; query: never; answer: TaughtView };
-  /** One kind, with its TOML */
-  "GET /v1/knowledge/kinds/{name}": { body: never; query: never; answer: KindView };
-  /** One panel, with its TOML */
-  "GET /v1/knowledge/panels/{name}": { body: never; query: never; answer: PanelView };
-  /** Forget a taught kind or panel */
-  "DELETE /v1/knowledge/{group}/{name}": { body: never; query: never; answer: null };
-  /** Stored images, newest first */
-  "GET /v1/images": { body: never; query: never; answer: ImageList };
-  /** Store a PNG, JPEG or BMP */
-  "POST /v1/images": { body: Blob; query: never; answer: ImageView };
-  /** The image itself */
-  "GET /v1/images/{image_id}": { body: never; query: never; answer: Blob };
-  /** Delete a stored image */
-  "DELETE /v1/images/{image_id}": { body: never; query: never; answer: null };
-  /** Read one instrument in a stored photograph */
-  "POST /v1/read-photograph": { body: ReadPhotographRequest; query: never; answer: PhotographReading };
-  /** Poses of the devices, the flange and the panel */
-  "GET /v1/frames": { body: never; query: never; answer: FrameList };
-  /** The panel file, with the limits that people have set */
-  "GET /v1/panel": { body: never; query: never; answer: Record<string, unknown> };
-  /** The calibration of one device, with its TOML */
-  "GET /v1/calibrations/{name}": { body: never; query: never; answer: CalibrationView };
-  /** Use the cell file's own record again; the measured one is kept among the older ones */
-  "DELETE /v1/calibrations/{name}": { body: never; query: never; answer: null };
-  /** Mission files that this cell can run */
-  "GET /v1/mission-files": { body: never; query: never; answer: MissionFileList };
-  /** A file of a mission: report.html, report.json or a picture */
-  "GET /v1/missions/{mission}/{name}": { body: never; query: never; answer: Blob };
-  /** Newest reading of each object */
-  "GET /v1/history": { body: never; query: never; answer: HistoryOverview };
-  /** Readings as a file: CSV, or Parquet with the extra `history` */
-  "GET /v1/history/export": { body: never; query: { format?: "csv" | "parquet"; object?: string | null; since_s?: number | null; until_s?: number | null }; answer: Blob };
-  /** Readings of one object: pages, or a trend */
-  "GET /v1/history/{object}": { body: never; query: { since_s?: number | null; until_s?: number | null; after?: number; limit?: number; buckets?: number }; answer: HistoryPage };
-  /** The picture of an object at a reading */
-  "GET /v1/history/{object}/crops/{crop}": { body: never; query: never; answer: Blob };
-  /** Readings and changes of alarms since the last call */
-  "GET /v1/feed": { body: never; query: { readings_after?: number | null; alarms_after?: number | null; wait_s?: number }; answer: Feed };
-  /** Alarms, those that need a person first */
-  "GET /v1/alarms": { body: never; query: { all?: boolean }; answer: AlarmList };
-  /** Say that a person has seen it */
-  "POST /v1/alarms/{alarm}/acknowledge": { body: AcknowledgeRequest; query: never; answer: AlarmView };
-  /** Shelve it until a time */
-  "POST /v1/alarms/{alarm}/shelve": { body: ShelveRequest; query: never; answer: AlarmView };
-  /** End its shelving */
-  "POST /v1/alarms/{alarm}/unshelve": { body: AcknowledgeRequest; query: never; answer: AlarmView };
-  /** Take it out of service */
-  "POST /v1/alarms/{alarm}/out-of-service": { body: ServiceRequest; query: never; answer: AlarmView };
-  /** Put it back in service */
-  "POST /v1/alarms/{alarm}/in-service": { body: AcknowledgeRequest; query: never; answer: AlarmView };
   /** Limits that were set in place of those of the panel file */
   "GET /v1/limits": { body: never; query: never; answer: LimitsList };
   /** Set the limits of an object, in place of those of the panel file */
   "PUT /v1/limits/{object}": { body: Limits; query: never; answer: null };
   /** Let the limits of the panel file hold again */
   "DELETE /v1/limits/{object}": { body: never; query: never; answer: null };
-  /** Rounds, with what comes next */
-  "GET /v1/rounds": { body: never; query: never; answer: RoundList };
-  /** Runs of a round, newest first */
-  "GET /v1/rounds/{round}/runs": { body: never; query: { limit?: number }; answer: RunList };
-  /** Add or replace a round that the cell file does not define */
-  "PUT /v1/rounds/{round}": { body: RoundSection; query: never; answer: null };
-  /** Remove a round that the cell file does not define */
-  "DELETE /v1/rounds/{round}": { body: never; query: never; answer: null };
+  /** Operate one control and read back whether it reached its target */
+  "POST /v1/manipulate": { body: ManipulateRequest; query: { wait_s?: number }; answer: ManipulateTask };
+  /** Mission files that this cell can run */
+  "GET /v1/mission-files": { body: never; query: never; answer: MissionFileList };
+  /** Run a mission and write its report; without a mission, inspect and touch nothing */
+  "POST /v1/missions": { body: MissionRequest; query: { wait_s?: number }; answer: MissionTask };
+  /** Missions with reports, newest first */
+  "GET /v1/missions": { body: never; query: never; answer: MissionList };
+  /** A file of a mission: report.html, report.json or a picture */
+  "GET /v1/missions/{mission}/{name}": { body: never; query: never; answer: Blob };
+  /** The panel file, with the limits that people have set */
+  "GET /v1/panel": { body: never; query: never; answer: Record<string, unknown> };
+  /** Locate the panel by lights, tags, outline or looks; the answer is its pose with covariance */
+  "POST /v1/panel-pose": { body: PanelPoseRequest; query: { wait_s?: number }; answer: PanelPoseTask };
+  /** Read one instrument in a stored photograph */
+  "POST /v1/read-photograph": { body: ReadPhotographRequest; query: never; answer: PhotographReading };
+  /** Find the panel's objects in the camera's image or surfaces in the range image */
+  "POST /v1/recognise": { body: RecogniseRequest; query: { wait_s?: number }; answer: RecogniseTask };
   /** Readings that wait for a person, newest first */
   "GET /v1/review": { body: never; query: { limit?: number }; answer: ReviewList };
   /** Say what a reading shows */
   "POST /v1/review/{reading}": { body: AnswerRequest; query: never; answer: HistoryReading };
+  /** Rounds, with what comes next */
+  "GET /v1/rounds": { body: never; query: never; answer: RoundList };
+  /** Add or replace a round that the cell file does not define */
+  "PUT /v1/rounds/{round}": { body: RoundSection; query: never; answer: null };
+  /** Remove a round that the cell file does not define */
+  "DELETE /v1/rounds/{round}": { body: never; query: never; answer: null };
+  /** Runs of a round, newest first */
+  "GET /v1/rounds/{round}/runs": { body: never; query: { limit?: number }; answer: RunList };
   /** Who asks, and in which role */
   "GET /v1/session": { body: never; query: never; answer: SessionView };
   /** Log a browser in with a key; the answer sets a cookie */
   "POST /v1/session": { body: LoginRequest; query: never; answer: SessionView };
   /** Log out */
   "DELETE /v1/session": { body: never; query: never; answer: SessionView };
+  /** State of the software stop */
+  "GET /v1/stop": { body: never; query: never; answer: StopView };
+  /** Stop the arm; anybody may do this at any time, without a body */
+  "POST /v1/stop": { body: never; query: never; answer: StopView };
+  /** Clear the stop; this alone moves nothing */
+  "POST /v1/stop/reset": { body: ResetRequest; query: never; answer: StopView };
+  /** Kept tasks, newest first */
+  "GET /v1/tasks": { body: never; query: { state?: "queued" | "running" | "cancelling" | "succeeded" | "failed" | "cancelled" | null; limit?: number }; answer: TaskList };
+  /** One task */
+  "GET /v1/tasks/{task_id}": { body: never; query: { wait_s?: number }; answer: TaskView };
+  /** A file that the task produced */
+  "GET /v1/tasks/{task_id}/artefacts/{name}": { body: never; query: never; answer: Blob };
+  /** Stop the arm, then end the task */
+  "POST /v1/tasks/{task_id}/cancel": { body: never; query: { wait_s?: number }; answer: TaskView };
+  /** Let a paused mission go on */
+  "POST /v1/tasks/{task_id}/go-on": { body: never; query: never; answer: TaskView };
+  /** Stand still before the next step of a mission */
+  "POST /v1/tasks/{task_id}/pause": { body: never; query: never; answer: TaskView };
 }

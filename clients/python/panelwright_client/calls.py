@@ -83,148 +83,41 @@ from panelwright_client.transport import Transport
 class Client(Transport):
     """Calls one service; each method is one call of its API, with the same name."""
 
-    def show_lease(self) -> LeaseView:
-        """Who may move."""
-        return self._call("GET", "/v1/lease", LeaseView)
-
-    def acquire_lease(self, request: LeaseRequest) -> GrantView:
-        """Take the free lease."""
-        return self._call("POST", "/v1/lease", GrantView, body=request)
-
-    def renew_lease(self) -> GrantView:
-        """Renew the lease."""
-        return self._call("POST", "/v1/lease/heartbeat", GrantView)
-
-    def release_lease(self) -> LeaseView:
-        """Give the lease back."""
-        return self._call("POST", "/v1/lease/release", LeaseView)
-
-    def take_over_lease(self, request: TakeOverRequest) -> GrantView:
-        """Take the lease from its holder; the tasks of that holder are stopped."""
-        return self._call("POST", "/v1/lease/take-over", GrantView, body=request)
-
-    def show_stop(self) -> StopView:
-        """State of the software stop."""
-        return self._call("GET", "/v1/stop", StopView)
-
-    def stop(self) -> StopView:
-        """Stop the arm; anybody may do this at any time, without a body."""
-        return self._call("POST", "/v1/stop", StopView)
-
-    def reset_stop(self, request: ResetRequest | None = None) -> StopView:
-        """Clear the stop; this alone moves nothing."""
-        return self._call("POST", "/v1/stop/reset", StopView, body=request)
-
     def healthz(self) -> HealthzView:
         """Whether the service answers."""
         return self._call("GET", "/healthz", HealthzView)
-
-    def readyz(self) -> ReadyView:
-        """Whether the cell is ready, and for what."""
-        return self._call("GET", "/readyz", ReadyView)
 
     def metrics(self) -> bytes:
         """Prometheus metrics."""
         return self._call("GET", "/metrics", bytes)
 
-    def info(self) -> InfoView:
-        """What this is."""
-        return self._call("GET", "/v1/info", InfoView)
+    def readyz(self) -> ReadyView:
+        """Whether the cell is ready, and for what."""
+        return self._call("GET", "/readyz", ReadyView)
 
-    def panel_pose(
-        self, request: PanelPoseRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> PanelPoseTask:
-        """Locate the panel by lights, tags, outline or looks; the answer is its pose with covariance."""
-        return self._call(
-            "POST",
-            "/v1/panel-pose",
-            PanelPoseTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
+    def list_alarms(self, *, all: bool = False) -> AlarmList:
+        """Alarms, those that need a person first."""
+        return self._call("GET", "/v1/alarms", AlarmList, query={"all": all})
 
-    def recognise(
-        self, request: RecogniseRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> RecogniseTask:
-        """Find the panel's objects in the camera's image or surfaces in the range image."""
-        return self._call(
-            "POST",
-            "/v1/recognise",
-            RecogniseTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
+    def acknowledge_alarm(self, alarm: str, request: AcknowledgeRequest) -> AlarmView:
+        """Say that a person has seen it."""
+        return self._call("POST", f"/v1/alarms/{alarm}/acknowledge", AlarmView, body=request)
 
-    def learn(
-        self, request: LearnRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> LearnTask:
-        """Learn what the objects of the located panel look like, for blind recognition."""
-        return self._call(
-            "POST",
-            "/v1/learn",
-            LearnTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
+    def put_alarm_in_service(self, alarm: str, request: AcknowledgeRequest) -> AlarmView:
+        """Put it back in service."""
+        return self._call("POST", f"/v1/alarms/{alarm}/in-service", AlarmView, body=request)
 
-    def inspect(
-        self, request: InspectRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> InspectTask:
-        """Read instruments, lamps, switches and valves from close up."""
-        return self._call(
-            "POST",
-            "/v1/inspect",
-            InspectTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
+    def take_alarm_out_of_service(self, alarm: str, request: ServiceRequest) -> AlarmView:
+        """Take it out of service."""
+        return self._call("POST", f"/v1/alarms/{alarm}/out-of-service", AlarmView, body=request)
 
-    def fuse(
-        self, request: FuseRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> FuseTask:
-        """Fuse measurements of nine kinds into one pose, or collect them first."""
-        return self._call(
-            "POST",
-            "/v1/fuse",
-            FuseTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
+    def shelve_alarm(self, alarm: str, request: ShelveRequest) -> AlarmView:
+        """Shelve it until a time."""
+        return self._call("POST", f"/v1/alarms/{alarm}/shelve", AlarmView, body=request)
 
-    def manipulate(
-        self, request: ManipulateRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> ManipulateTask:
-        """Operate one control and read back whether it reached its target."""
-        return self._call(
-            "POST",
-            "/v1/manipulate",
-            ManipulateTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
-
-    def missions(
-        self, request: MissionRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> MissionTask:
-        """Run a mission and write its report; without a mission, inspect and touch nothing."""
-        return self._call(
-            "POST",
-            "/v1/missions",
-            MissionTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
-
-    def list_missions(self) -> MissionList:
-        """Missions with reports, newest first."""
-        return self._call("GET", "/v1/missions", MissionList)
+    def unshelve_alarm(self, alarm: str, request: AcknowledgeRequest) -> AlarmView:
+        """End its shelving."""
+        return self._call("POST", f"/v1/alarms/{alarm}/unshelve", AlarmView, body=request)
 
     def calibrations(
         self, request: CalibrationRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
@@ -243,47 +136,13 @@ class Client(Transport):
         """Calibrations in use."""
         return self._call("GET", "/v1/calibrations", CalibrationList, query={"toml": toml})
 
-    def judge(
-        self, request: EvaluateRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
-    ) -> EvaluateTask:
-        """Compare a finished mission with the simulator's truth (simulated cells only)."""
-        return self._call(
-            "POST",
-            "/v1/judge",
-            EvaluateTask,
-            body=request,
-            query={"wait_s": wait_s},
-            headers={"Idempotency-Key": idempotency_key},
-        )
+    def show_calibration(self, name: str) -> CalibrationView:
+        """The calibration of one device, with its TOML."""
+        return self._call("GET", f"/v1/calibrations/{name}", CalibrationView)
 
-    def list_tasks(
-        self,
-        *,
-        state: Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled"] | None = None,
-        limit: int = 100,
-    ) -> TaskList:
-        """Kept tasks, newest first."""
-        return self._call("GET", "/v1/tasks", TaskList, query={"state": state, "limit": limit})
-
-    def show_task(self, task_id: str, *, wait_s: float = 0.0) -> TaskView:
-        """One task."""
-        return self._call("GET", f"/v1/tasks/{task_id}", TaskView, query={"wait_s": wait_s})
-
-    def cancel_task(self, task_id: str, *, wait_s: float = 0.0) -> TaskView:
-        """Stop the arm, then end the task."""
-        return self._call("POST", f"/v1/tasks/{task_id}/cancel", TaskView, query={"wait_s": wait_s})
-
-    def pause_task(self, task_id: str) -> TaskView:
-        """Stand still before the next step of a mission."""
-        return self._call("POST", f"/v1/tasks/{task_id}/pause", TaskView)
-
-    def let_task_go_on(self, task_id: str) -> TaskView:
-        """Let a paused mission go on."""
-        return self._call("POST", f"/v1/tasks/{task_id}/go-on", TaskView)
-
-    def fetch_artefact(self, task_id: str, name: str) -> bytes:
-        """A file that the task produced."""
-        return self._call("GET", f"/v1/tasks/{task_id}/artefacts/{name}", bytes)
+    def forget_calibration(self, name: str) -> None:
+        """Use the cell file's own record again; the measured one is kept among the older ones."""
+        self._call("DELETE", f"/v1/calibrations/{name}", type(None))
 
     def list_devices(self) -> DeviceList:
         """All devices with their health."""
@@ -297,6 +156,14 @@ class Client(Transport):
         """Replace a device's driver or options while the cell runs."""
         return self._call("PUT", f"/v1/devices/{name}", DeviceDetail, body=request)
 
+    def connect_device(self, name: str) -> DeviceDetail:
+        """Connect a device again with its present driver and options."""
+        return self._call("POST", f"/v1/devices/{name}/connect", DeviceDetail)
+
+    def inject_fault(self, name: str, request: FaultRequest | None = None) -> DeviceView:
+        """Inject a fault into a simulated device, or end it."""
+        return self._call("POST", f"/v1/devices/{name}/fault", DeviceView, body=request)
+
     def read_device(self, name: str, *, max_age_s: float = 0.0) -> ReadingView:
         """The newest reading: JSON, or PNG and npz for images and ranges."""
         return self._call("GET", f"/v1/devices/{name}/reading", ReadingView, query={"max_age_s": max_age_s})
@@ -307,85 +174,33 @@ class Client(Transport):
         """The newest reading: JSON, or PNG and npz for images and ranges."""
         return self._call("GET", f"/v1/devices/{name}/reading", bytes, query={"format": format, "max_age_s": max_age_s})
 
-    def connect_device(self, name: str) -> DeviceDetail:
-        """Connect a device again with its present driver and options."""
-        return self._call("POST", f"/v1/devices/{name}/connect", DeviceDetail)
-
-    def inject_fault(self, name: str, request: FaultRequest | None = None) -> DeviceView:
-        """Inject a fault into a simulated device, or end it."""
-        return self._call("POST", f"/v1/devices/{name}/fault", DeviceView, body=request)
-
-    def list_knowledge(self, *, toml: bool = True) -> KnowledgeView:
-        """Kinds, objects and panels, with their TOML."""
-        return self._call("GET", "/v1/knowledge", KnowledgeView, query={"toml": toml})
-
-    def list_questions(self, *, kind: str | None = None) -> QuestionList:
-        """Questions of the dialogue about an object of a kind."""
-        return self._call("GET", "/v1/knowledge/questions", QuestionList, query={"kind": kind})
-
-    def find_outline(self, request: OutlineRequest) -> OutlineView:
-        """Find the object at one to three clicks in a stored image; writes nothing."""
-        return self._call("POST", "/v1/knowledge/outline", OutlineView, body=request)
-
-    def teach(self, request: TeachRequest) -> TaughtView:
-        """Teach a kind by clicks, or a whole panel by clicks and answers."""
-        return self._call("POST", "/v1/knowledge/teach", TaughtView, body=request)
-
-    def show_kind(self, name: str) -> KindView:
-        """One kind, with its TOML."""
-        return self._call("GET", f"/v1/knowledge/kinds/{name}", KindView)
-
-    def show_panel_knowledge(self, name: str) -> PanelView:
-        """One panel, with its TOML."""
-        return self._call("GET", f"/v1/knowledge/panels/{name}", PanelView)
-
-    def forget_knowledge(self, group: str, name: str) -> None:
-        """Forget a taught kind or panel."""
-        self._call("DELETE", f"/v1/knowledge/{group}/{name}", type(None))
-
-    def list_images(self) -> ImageList:
-        """Stored images, newest first."""
-        return self._call("GET", "/v1/images", ImageList)
-
-    def store_image(self, data: bytes, *, media_type: str = "image/png") -> ImageView:
-        """Store a PNG, JPEG or BMP."""
-        return self._call("POST", "/v1/images", ImageView, data=data, headers={"Content-Type": media_type})
-
-    def fetch_image(self, image_id: str) -> bytes:
-        """The image itself."""
-        return self._call("GET", f"/v1/images/{image_id}", bytes)
-
-    def delete_image(self, image_id: str) -> None:
-        """Delete a stored image."""
-        self._call("DELETE", f"/v1/images/{image_id}", type(None))
-
-    def read_photograph(self, request: ReadPhotographRequest) -> PhotographReading:
-        """Read one instrument in a stored photograph."""
-        return self._call("POST", "/v1/read-photograph", PhotographReading, body=request)
+    def follow_feed(
+        self, *, readings_after: int | None = None, alarms_after: int | None = None, wait_s: float = 0.0
+    ) -> Feed:
+        """Readings and changes of alarms since the last call."""
+        return self._call(
+            "GET",
+            "/v1/feed",
+            Feed,
+            query={"readings_after": readings_after, "alarms_after": alarms_after, "wait_s": wait_s},
+        )
 
     def list_frames(self) -> FrameList:
         """Poses of the devices, the flange and the panel."""
         return self._call("GET", "/v1/frames", FrameList)
 
-    def show_panel(self) -> dict[str, Any]:
-        """The panel file, with the limits that people have set."""
-        return self._call("GET", "/v1/panel", dict[str, Any])
-
-    def show_calibration(self, name: str) -> CalibrationView:
-        """The calibration of one device, with its TOML."""
-        return self._call("GET", f"/v1/calibrations/{name}", CalibrationView)
-
-    def forget_calibration(self, name: str) -> None:
-        """Use the cell file's own record again; the measured one is kept among the older ones."""
-        self._call("DELETE", f"/v1/calibrations/{name}", type(None))
-
-    def list_mission_files(self) -> MissionFileList:
-        """Mission files that this cell can run."""
-        return self._call("GET", "/v1/mission-files", MissionFileList)
-
-    def fetch_mission_file(self, mission: str, name: str) -> bytes:
-        """A file of a mission: report.html, report.json or a picture."""
-        return self._call("GET", f"/v1/missions/{mission}/{name}", bytes)
+    def fuse(
+        self, request: FuseRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> FuseTask:
+        """Fuse measurements of nine kinds into one pose, or collect them first."""
+        return self._call(
+            "POST",
+            "/v1/fuse",
+            FuseTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
+        )
 
     def history_overview(self) -> HistoryOverview:
         """Newest reading of each object."""
@@ -429,40 +244,112 @@ class Client(Transport):
         """The picture of an object at a reading."""
         return self._call("GET", f"/v1/history/{object}/crops/{crop}", bytes)
 
-    def follow_feed(
-        self, *, readings_after: int | None = None, alarms_after: int | None = None, wait_s: float = 0.0
-    ) -> Feed:
-        """Readings and changes of alarms since the last call."""
+    def list_images(self) -> ImageList:
+        """Stored images, newest first."""
+        return self._call("GET", "/v1/images", ImageList)
+
+    def store_image(self, data: bytes, *, media_type: str = "image/png") -> ImageView:
+        """Store a PNG, JPEG or BMP."""
+        return self._call("POST", "/v1/images", ImageView, data=data, headers={"Content-Type": media_type})
+
+    def fetch_image(self, image_id: str) -> bytes:
+        """The image itself."""
+        return self._call("GET", f"/v1/images/{image_id}", bytes)
+
+    def delete_image(self, image_id: str) -> None:
+        """Delete a stored image."""
+        self._call("DELETE", f"/v1/images/{image_id}", type(None))
+
+    def info(self) -> InfoView:
+        """What this is."""
+        return self._call("GET", "/v1/info", InfoView)
+
+    def inspect(
+        self, request: InspectRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> InspectTask:
+        """Read instruments, lamps, switches and valves from close up."""
         return self._call(
-            "GET",
-            "/v1/feed",
-            Feed,
-            query={"readings_after": readings_after, "alarms_after": alarms_after, "wait_s": wait_s},
+            "POST",
+            "/v1/inspect",
+            InspectTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
         )
 
-    def list_alarms(self, *, all: bool = False) -> AlarmList:
-        """Alarms, those that need a person first."""
-        return self._call("GET", "/v1/alarms", AlarmList, query={"all": all})
+    def judge(
+        self, request: EvaluateRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> EvaluateTask:
+        """Compare a finished mission with the simulator's truth (simulated cells only)."""
+        return self._call(
+            "POST",
+            "/v1/judge",
+            EvaluateTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
+        )
 
-    def acknowledge_alarm(self, alarm: str, request: AcknowledgeRequest) -> AlarmView:
-        """Say that a person has seen it."""
-        return self._call("POST", f"/v1/alarms/{alarm}/acknowledge", AlarmView, body=request)
+    def list_knowledge(self, *, toml: bool = True) -> KnowledgeView:
+        """Kinds, objects and panels, with their TOML."""
+        return self._call("GET", "/v1/knowledge", KnowledgeView, query={"toml": toml})
 
-    def shelve_alarm(self, alarm: str, request: ShelveRequest) -> AlarmView:
-        """Shelve it until a time."""
-        return self._call("POST", f"/v1/alarms/{alarm}/shelve", AlarmView, body=request)
+    def show_kind(self, name: str) -> KindView:
+        """One kind, with its TOML."""
+        return self._call("GET", f"/v1/knowledge/kinds/{name}", KindView)
 
-    def unshelve_alarm(self, alarm: str, request: AcknowledgeRequest) -> AlarmView:
-        """End its shelving."""
-        return self._call("POST", f"/v1/alarms/{alarm}/unshelve", AlarmView, body=request)
+    def find_outline(self, request: OutlineRequest) -> OutlineView:
+        """Find the object at one to three clicks in a stored image; writes nothing."""
+        return self._call("POST", "/v1/knowledge/outline", OutlineView, body=request)
 
-    def take_alarm_out_of_service(self, alarm: str, request: ServiceRequest) -> AlarmView:
-        """Take it out of service."""
-        return self._call("POST", f"/v1/alarms/{alarm}/out-of-service", AlarmView, body=request)
+    def show_panel_knowledge(self, name: str) -> PanelView:
+        """One panel, with its TOML."""
+        return self._call("GET", f"/v1/knowledge/panels/{name}", PanelView)
 
-    def put_alarm_in_service(self, alarm: str, request: AcknowledgeRequest) -> AlarmView:
-        """Put it back in service."""
-        return self._call("POST", f"/v1/alarms/{alarm}/in-service", AlarmView, body=request)
+    def list_questions(self, *, kind: str | None = None) -> QuestionList:
+        """Questions of the dialogue about an object of a kind."""
+        return self._call("GET", "/v1/knowledge/questions", QuestionList, query={"kind": kind})
+
+    def teach(self, request: TeachRequest) -> TaughtView:
+        """Teach a kind by clicks, or a whole panel by clicks and answers."""
+        return self._call("POST", "/v1/knowledge/teach", TaughtView, body=request)
+
+    def forget_knowledge(self, group: str, name: str) -> None:
+        """Forget a taught kind or panel."""
+        self._call("DELETE", f"/v1/knowledge/{group}/{name}", type(None))
+
+    def learn(
+        self, request: LearnRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> LearnTask:
+        """Learn what the objects of the located panel look like, for blind recognition."""
+        return self._call(
+            "POST",
+            "/v1/learn",
+            LearnTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
+        )
+
+    def show_lease(self) -> LeaseView:
+        """Who may move."""
+        return self._call("GET", "/v1/lease", LeaseView)
+
+    def acquire_lease(self, request: LeaseRequest) -> GrantView:
+        """Take the free lease."""
+        return self._call("POST", "/v1/lease", GrantView, body=request)
+
+    def renew_lease(self) -> GrantView:
+        """Renew the lease."""
+        return self._call("POST", "/v1/lease/heartbeat", GrantView)
+
+    def release_lease(self) -> LeaseView:
+        """Give the lease back."""
+        return self._call("POST", "/v1/lease/release", LeaseView)
+
+    def take_over_lease(self, request: TakeOverRequest) -> GrantView:
+        """Take the lease from its holder; the tasks of that holder are stopped."""
+        return self._call("POST", "/v1/lease/take-over", GrantView, body=request)
 
     def list_limits(self) -> LimitsList:
         """Limits that were set in place of those of the panel file."""
@@ -476,13 +363,89 @@ class Client(Transport):
         """Let the limits of the panel file hold again."""
         self._call("DELETE", f"/v1/limits/{object}", type(None))
 
+    def manipulate(
+        self, request: ManipulateRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> ManipulateTask:
+        """Operate one control and read back whether it reached its target."""
+        return self._call(
+            "POST",
+            "/v1/manipulate",
+            ManipulateTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
+        )
+
+    def list_mission_files(self) -> MissionFileList:
+        """Mission files that this cell can run."""
+        return self._call("GET", "/v1/mission-files", MissionFileList)
+
+    def missions(
+        self, request: MissionRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> MissionTask:
+        """Run a mission and write its report; without a mission, inspect and touch nothing."""
+        return self._call(
+            "POST",
+            "/v1/missions",
+            MissionTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
+        )
+
+    def list_missions(self) -> MissionList:
+        """Missions with reports, newest first."""
+        return self._call("GET", "/v1/missions", MissionList)
+
+    def fetch_mission_file(self, mission: str, name: str) -> bytes:
+        """A file of a mission: report.html, report.json or a picture."""
+        return self._call("GET", f"/v1/missions/{mission}/{name}", bytes)
+
+    def show_panel(self) -> dict[str, Any]:
+        """The panel file, with the limits that people have set."""
+        return self._call("GET", "/v1/panel", dict[str, Any])
+
+    def panel_pose(
+        self, request: PanelPoseRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> PanelPoseTask:
+        """Locate the panel by lights, tags, outline or looks; the answer is its pose with covariance."""
+        return self._call(
+            "POST",
+            "/v1/panel-pose",
+            PanelPoseTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
+        )
+
+    def read_photograph(self, request: ReadPhotographRequest) -> PhotographReading:
+        """Read one instrument in a stored photograph."""
+        return self._call("POST", "/v1/read-photograph", PhotographReading, body=request)
+
+    def recognise(
+        self, request: RecogniseRequest | None = None, *, wait_s: float = 0.0, idempotency_key: str | None = None
+    ) -> RecogniseTask:
+        """Find the panel's objects in the camera's image or surfaces in the range image."""
+        return self._call(
+            "POST",
+            "/v1/recognise",
+            RecogniseTask,
+            body=request,
+            query={"wait_s": wait_s},
+            headers={"Idempotency-Key": idempotency_key},
+        )
+
+    def list_review(self, *, limit: int = 100) -> ReviewList:
+        """Readings that wait for a person, newest first."""
+        return self._call("GET", "/v1/review", ReviewList, query={"limit": limit})
+
+    def answer_review(self, reading: str, request: AnswerRequest) -> HistoryReading:
+        """Say what a reading shows."""
+        return self._call("POST", f"/v1/review/{reading}", HistoryReading, body=request)
+
     def list_rounds(self) -> RoundList:
         """Rounds, with what comes next."""
         return self._call("GET", "/v1/rounds", RoundList)
-
-    def list_round_runs(self, round: str, *, limit: int = 100) -> RunList:
-        """Runs of a round, newest first."""
-        return self._call("GET", f"/v1/rounds/{round}/runs", RunList, query={"limit": limit})
 
     def define_round(self, round: str, request: RoundSection) -> None:
         """Add or replace a round that the cell file does not define."""
@@ -492,13 +455,9 @@ class Client(Transport):
         """Remove a round that the cell file does not define."""
         self._call("DELETE", f"/v1/rounds/{round}", type(None))
 
-    def list_review(self, *, limit: int = 100) -> ReviewList:
-        """Readings that wait for a person, newest first."""
-        return self._call("GET", "/v1/review", ReviewList, query={"limit": limit})
-
-    def answer_review(self, reading: str, request: AnswerRequest) -> HistoryReading:
-        """Say what a reading shows."""
-        return self._call("POST", f"/v1/review/{reading}", HistoryReading, body=request)
+    def list_round_runs(self, round: str, *, limit: int = 100) -> RunList:
+        """Runs of a round, newest first."""
+        return self._call("GET", f"/v1/rounds/{round}/runs", RunList, query={"limit": limit})
 
     def show_session(self) -> SessionView:
         """Who asks, and in which role."""
@@ -511,3 +470,44 @@ class Client(Transport):
     def log_out(self) -> SessionView:
         """Log out."""
         return self._call("DELETE", "/v1/session", SessionView)
+
+    def show_stop(self) -> StopView:
+        """State of the software stop."""
+        return self._call("GET", "/v1/stop", StopView)
+
+    def stop(self) -> StopView:
+        """Stop the arm; anybody may do this at any time, without a body."""
+        return self._call("POST", "/v1/stop", StopView)
+
+    def reset_stop(self, request: ResetRequest | None = None) -> StopView:
+        """Clear the stop; this alone moves nothing."""
+        return self._call("POST", "/v1/stop/reset", StopView, body=request)
+
+    def list_tasks(
+        self,
+        *,
+        state: Literal["queued", "running", "cancelling", "succeeded", "failed", "cancelled"] | None = None,
+        limit: int = 100,
+    ) -> TaskList:
+        """Kept tasks, newest first."""
+        return self._call("GET", "/v1/tasks", TaskList, query={"state": state, "limit": limit})
+
+    def show_task(self, task_id: str, *, wait_s: float = 0.0) -> TaskView:
+        """One task."""
+        return self._call("GET", f"/v1/tasks/{task_id}", TaskView, query={"wait_s": wait_s})
+
+    def fetch_artefact(self, task_id: str, name: str) -> bytes:
+        """A file that the task produced."""
+        return self._call("GET", f"/v1/tasks/{task_id}/artefacts/{name}", bytes)
+
+    def cancel_task(self, task_id: str, *, wait_s: float = 0.0) -> TaskView:
+        """Stop the arm, then end the task."""
+        return self._call("POST", f"/v1/tasks/{task_id}/cancel", TaskView, query={"wait_s": wait_s})
+
+    def let_task_go_on(self, task_id: str) -> TaskView:
+        """Let a paused mission go on."""
+        return self._call("POST", f"/v1/tasks/{task_id}/go-on", TaskView)
+
+    def pause_task(self, task_id: str) -> TaskView:
+        """Stand still before the next step of a mission."""
+        return self._call("POST", f"/v1/tasks/{task_id}/pause", TaskView)

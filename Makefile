@@ -4,6 +4,7 @@ BIN := .venv/bin
 PRODUCT := hal drivers simbackend perception fusion manipulation service
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+unexport PYTHONDONTWRITEBYTECODE  # where it is set, every process compiles all that it imports, about three seconds
 
 # uv fetches packages side by side and refuses files whose hash is not in hashes.txt. It does not read pip's configuration: where
 # it finds nothing, pip does the same without hashes. Both say nothing while they fetch, so a line every five seconds does.

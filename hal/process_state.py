@@ -61,11 +61,13 @@ class ThreadTimes:
         state: letter of the operating system: R runs or could run, D waits in the kernel (for a disk), S sleeps.
         computed_s: time on a processor.
         waited_s: time in which it could have run and no processor was free, up to its newest turn.
+        turns: how often it has had a processor.
     """
 
     state: str
     computed_s: float
     waited_s: float
+    turns: int
 
 
 def threads_of(pid: int) -> dict[int, ThreadTimes]:
@@ -82,9 +84,9 @@ def thread_times(pid: int, thread: int) -> ThreadTimes | None:
     """Return the times of one thread; None when it has ended, or where the operating system does not tell them."""
     folder = Path(f"/proc/{pid}/task/{thread}")
     try:
-        computed, waited, _ = (folder / "schedstat").read_text(encoding="ascii").split()
+        computed, waited, turns = (folder / "schedstat").read_text(encoding="ascii").split()
         stat = (folder / "stat").read_text(encoding="utf-8", errors="replace")
     except (OSError, ValueError):
         return None
     letter = stat.rpartition(")")[2].split()[0]
-    return ThreadTimes(state=letter, computed_s=1e-9 * int(computed), waited_s=1e-9 * int(waited))
+    return ThreadTimes(state=letter, computed_s=1e-9 * int(computed), waited_s=1e-9 * int(waited), turns=int(turns))

@@ -15,20 +15,22 @@ from numba.core.compiler_lock import global_compiler_lock
 import hal.jit  # noqa: F401 - the compiler of this project declares its pauses
 from hal import pauses
 from hal.process_state import ProcessState, process_state
-from service.processes.beat import LOOK_S, Beat
+from service.processes.beat import ASLEEP_S, LOOK_S, STILL_S, Beat
 from service.processes.latch import Latch
 from service.processes.stop import Watchdog
 from tests.service.waiting import eventually
 
 BEATS = """
 import ctypes, pathlib, signal, sys
-from service.processes.beat import Beat
+from service.processes.beat import Beat, every_beat
 
 signal.signal(signal.SIGUSR1, lambda *_: ctypes.PyDLL(None).sleep(600))  # its calls keep the lock of Python
 signal.signal(signal.SIGUSR2, lambda *_: sum(range(10**12)))
+signal.signal(signal.SIGALRM, lambda *_: ended.set())
 beat = Beat(pathlib.Path(sys.argv[1]), "cell")
+ended = every_beat(beat.beat, name="heartbeat")
 while True:
-    beat.beat()
+    signal.pause()
 """
 
 
@@ -64,6 +66,18 @@ def test_a_process_whose_threads_all_wait_for_one_that_sleeps_is_lost_long_befor
 ) -> None:
     beat, pid = other
     os.kill(pid, signal.SIGUSR1)
+    assert "hangs" in str(eventually(lambda: beat.lost(silence_s=600.0)))
+    assert beat.age_s() < ASLEEP_S, "the heartbeat asks for the lock again and again"
+
+
+def test_a_heartbeat_that_only_sleeps_for_long_is_the_machines_until_a_second_has_passed(
+    other: tuple[Beat, int],
+) -> None:
+    beat, pid = other
+    os.kill(pid, signal.SIGALRM)  # all threads sleep, as where a virtual machine gets no processor of its host
+    assert eventually(lambda: beat.age_s() > 2 * (LOOK_S + STILL_S))
+    while beat.age_s() < 0.9 * ASLEEP_S:
+        assert beat.lost(silence_s=600.0) is None
     assert "hangs" in str(eventually(lambda: beat.lost(silence_s=600.0)))
 
 

@@ -209,6 +209,7 @@ def _turn_once(
     except SkillFailure:
         belief.failed.add(hold)
         raise
+    turn.free_rad = free_turn_rad(wheel, where, sign)
     try:
         turn.turn(part_rad)
         _note(where, turn, sign)
@@ -233,6 +234,14 @@ def _note(where: InitialState, turn: WheelTurn, sign: float) -> None:
     """Keep how far the wheel has turned, and that it cannot have turned further than the hand."""
     ends = (-sign * DRAGGED_RAD, sign * turn.hand_rad)
     where.moved_by(sign * turn.moved_rad, least=min(ends), largest=max(ends))
+
+
+def free_turn_rad(wheel: Handwheel, where: InitialState, sign: float) -> float:
+    """Return how far the wheel can surely turn before it meets an end stop; 0 where its whole turns are not known."""
+    if not where.is_sure:
+        return 0.0
+    stop = wheel.maximum_rad if sign > 0 else wheel.minimum_rad
+    return max(0.0, abs(stop - where.known) - AT_STOP_RAD)
 
 
 def at_a_stop(wheel: Handwheel, angle_rad: float, sign: float, outcome: Outcome) -> float:

@@ -16,7 +16,7 @@ from hal.motion import Guard, Quantity
 from hal.panel import Scale, Slider
 from manipulation.planning.cartesian_path import shifted
 from manipulation.skills.attempt import STANDOFF_M, Attempt
-from manipulation.skills.contact import force_at_rest_n, meet
+from manipulation.skills.contact import meet, onset
 from manipulation.skills.context import SkillContext, panel_from_grip
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import (
@@ -40,7 +40,8 @@ SEEK_N = 1.3  # above noise and inertia, and below the friction of most sliders
 # above this force for so long.
 LIGHT_N, LIGHT_TICKS = 0.5, 25
 PUSH_M_PER_S = 0.05
-SHORT_M = 0.003  # the push pauses at this distance from the end to measure the compression of the pads
+SHORT_M = 0.003  # the push pauses at this distance from the end to measure how far the tip is pressed beyond the face
+LET_GO_M, LET_GO_M_PER_S = 0.004, 0.03
 TOLERANCE_RATIO = 0.02
 LARGEST_STOP_N = 36.0
 SEEN_SIGMA_M = 0.00015  # of the best look: a third of a pixel from close up
@@ -173,11 +174,11 @@ def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:
     length = abs(push.goal_m - push.start_m)
     start = attempt.pose().translation
     _go(attempt, fader, ahead, max(0.0, length + face - SHORT_M), "push")
-    give = _give_m(attempt, ahead)
+    give = _let_go(attempt, ahead)
     so_far = float((attempt.pose().translation - start) @ ahead)
     _go(attempt, fader, ahead, max(0.0, length + face + give - so_far), "push to the end")
-    moved = float((attempt.pose().translation - start) @ ahead) - face - _give_m(attempt, ahead)
-    _go(attempt, fader, -ahead, 0.004, "let go")
+    loaded = float((attempt.pose().translation - start) @ ahead)
+    moved = loaded - face - _let_go(attempt, ahead)
     attempt.leave()
     return push.sign * moved
 
@@ -217,7 +218,15 @@ def _go(attempt: Attempt, fader: Slider, ahead: np.ndarray, distance_m: float, n
         raise SkillFailure(Outcome.STALLED, f"the cap stopped against {report.peak_force_n:.0f} N")
 
 
-def _give_m(attempt: Attempt, ahead: np.ndarray) -> float:
-    """Return the compression of the pads under the force that friction maintains at rest, m."""
-    force = max(0.0, force_at_rest_n(attempt, attempt.pose().rotation.inv().apply(-ahead)))
-    return force / attempt.context.hand.pad_stiffness_n_per_m
+def _let_go(attempt: Attempt, ahead: np.ndarray) -> float:
+    """Move back from the cap; returns how far the tip had been pressed beyond its face, m.
+
+    Friction holds the cap, so the force falls to zero where the tip leaves it. How much pads, fingers and arm yield to a push
+    from this side need not be known.
+    """
+    loaded = attempt.pose()
+    back = attempt.straight(_moved(attempt, -LET_GO_M * ahead), name="let go", speed_m_per_s=LET_GO_M_PER_S)
+    depth = (back.log.tip_m - loaded.translation) @ ahead
+    force = back.log.wrench[:, :3] @ loaded.rotation.inv().apply(-ahead)
+    left, _ = onset(depth[::-1], force[::-1], 0.0)
+    return max(0.0, -left)

@@ -20,7 +20,7 @@ SLACK_RAD = 0.03
 POOR_FRICTION = 0.3  # of pads on paint, with which the first grip across a wheel reckons
 SPARE_GRIP = 1.3
 FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
-ACROSS_SIDE_M, LEAST_ACROSS_M = 0.006, 0.002  # wanted and least free space on each side of a hand across the wheel
+ACROSS_SIDE_M, LEAST_ACROSS_M = 0.006, 0.0005  # wanted and least free space on each side of a hand across the wheel
 GRIP_ACROSS_N = (20.0, 90.0)  # the force of one pad is taken by the other, so neither arm nor shaft feel it
 
 
@@ -116,7 +116,7 @@ def torques_nm(wheel: Handwheel, hand: Hand) -> dict[Hold, float]:
 
 def across_gap_m(wheel: Handwheel, hand: Hand) -> float:
     """Return the free space between each finger and the rim of a hand that is open across the wheel; may be negative."""
-    return min(ACROSS_SIDE_M, 0.5 * (hand.max_width_m - SPARE_M) - outer_m(wheel))
+    return min(ACROSS_SIDE_M, 0.5 * hand.max_width_m - outer_m(wheel))
 
 
 def outer_m(wheel: Handwheel) -> float:

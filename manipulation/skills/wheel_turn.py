@@ -58,6 +58,7 @@ class WheelTurn:
         speed_m_per_s: of the turn, where a turn of 1 rad counts as 0.1 m.
         is_across: whether the whole wheel is between the fingers, so that its hub is midway between them.
         side_per_nm: force along the line of the fingers for each N m, with which spokes that are not opposite push.
+        free_rad: turn in which no end stop can be met; 0 where that is not known.
         moved_rad: how far the wheel has turned, not negative.
     """
 
@@ -71,6 +72,7 @@ class WheelTurn:
     speed_m_per_s: float = TURN_M_PER_S
     side_per_nm: float = 0.0
     is_across: bool = False
+    free_rad: float = 0.0
     moved_rad: float = 0.0
     _felt: Felt = field(default_factory=Felt)
     _side_n: float = 0.0
@@ -202,7 +204,8 @@ class WheelTurn:
         effort = Guard(name="effort", quantity=Quantity.TORQUE, limit=self.most_nm, axis=against)
         if (self.open_m is not None and not self.is_across) or not self._felt.is_moving:
             return effort, side
-        limit = min(self.most_nm, STOP_RATIO * self._felt.running_nm + STOP_NM)
+        is_free = self._felt.moved_rad < self.free_rad  # what resists there is the wheel, which was felt to be too light
+        limit = self.most_nm if is_free else min(self.most_nm, STOP_RATIO * self._felt.running_nm + STOP_NM)
         slip_nm = SLIP_RATIO * self._felt.running_nm
         return (
             Guard(name="end stop", quantity=Quantity.TORQUE, limit=limit, axis=against),

@@ -27,7 +27,7 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 
 APPROACH_M_PER_S = 0.06
 CONTACT_N = 8.0
-STANDOFF_M = 0.030  # distance of the tips from the object's highest point
+STANDOFF_M = 0.020  # distance of the tips from the object's highest point
 RETREAT_M = 0.050
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1

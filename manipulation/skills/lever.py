@@ -28,7 +28,10 @@ STROKE_M_PER_S = 0.08
 LAST_RAD = np.radians(9.0)  # the last part is slow; at full speed the force at the end stop exceeds 300 N
 OVERTRAVEL_RAD = np.radians(12.0)  # compression of the pads
 LAST_M_PER_S = 0.018
-HEAVY_N, LAST_HEAVY_M_PER_S = 45.0, 0.009  # a heavy bar is brought to its end stop more slowly: less overshoot
+HEAVY_N, LAST_HEAVY_M_PER_S = (
+    45.0,
+    0.009,
+)  # the heavier a bar, the more slowly it is brought to its end stop: less overshoot
 END_RISE_N, HEAVY_RISE_N = 8.0, 4.0  # the stop of a heavy bar is met with little more than its friction
 # If the tool stops by more than this angle before the state, the cause is friction and not the end stop.
 SHORT_RAD = np.radians(1.0)
@@ -203,7 +206,8 @@ def _carry(attempt: Attempt, way: _Arc) -> float:
     """
     start = attempt.pose()
     felt_n = _turn_most(attempt, way, start, max(0.0, way.span_rad - LAST_RAD))
-    return _to_the_stop(attempt, way, start, LAST_M_PER_S if felt_n < HEAVY_N else LAST_HEAVY_M_PER_S, felt_n)
+    last_m_per_s = float(np.interp(felt_n, (HEAVY_N, LARGEST_N), (LAST_M_PER_S, LAST_HEAVY_M_PER_S)))
+    return _to_the_stop(attempt, way, start, last_m_per_s, felt_n)
 
 
 def _turn_most(attempt: Attempt, way: _Arc, start: RigidTransform, fast_rad: float) -> float:

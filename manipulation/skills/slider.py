@@ -39,7 +39,7 @@ SEEK_N = 1.3  # above noise and inertia, and below the friction of most sliders
 # The friction of a lighter slider is felt by its duration: the arm speeds up for 20 ticks only, and noise of 0.3 N is not
 # above this force for so long.
 LIGHT_N, LIGHT_TICKS = 0.5, 25
-PUSH_M_PER_S = 0.05
+PUSH_M_PER_S = 0.08
 SHORT_M = 0.003  # the push pauses at this distance from the end to measure how far the tip is pressed beyond the face
 LET_GO_M, LET_GO_M_PER_S = 0.004, 0.03
 TOLERANCE_RATIO = 0.02

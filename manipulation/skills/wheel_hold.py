@@ -35,7 +35,7 @@ ACROSS_RAD = tuple(float(a) for a in np.linspace(0.0, 2.0 * np.pi, 8, endpoint=F
 ACROSS_LAG_RAD = 0.3
 SPOKE_GAP_M = 0.0025  # between the inner finger and the spoke beside which it holds the rim
 GRIP_N = (12.0, 25.0)  # smallest and largest force of the pads; with 45 N friction along the fingers reached 70 N
-LIGHT_N, SETTLE_S, SETTLES = 8.0, 0.4, 6
+LIGHT_N, SETTLE_S, SETTLES = 8.0, 0.25, 6
 GRIP_STEP_N = 20.0
 EVEN_N = 3.0  # a larger side force shows that only one of the pads is at the rim
 # Pads that press lightly centre the hand on the rim before they press firmly: both pads move by one screw, so a rim that is

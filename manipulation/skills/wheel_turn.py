@@ -204,7 +204,9 @@ class WheelTurn:
         effort = Guard(name="effort", quantity=Quantity.TORQUE, limit=self.most_nm, axis=against)
         if (self.open_m is not None and not self.is_across) or not self._felt.is_moving:
             return effort, side
-        is_free = self._felt.moved_rad < self.free_rad  # what resists there is the wheel, which was felt to be too light
+        is_free = (
+            self._felt.moved_rad < self.free_rad
+        )  # what resists there is the wheel, which was felt to be too light
         limit = self.most_nm if is_free else min(self.most_nm, STOP_RATIO * self._felt.running_nm + STOP_NM)
         slip_nm = SLIP_RATIO * self._felt.running_nm
         return (

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.calibration import CameraIntrinsics
+from hal.camera_model import project
 from hal.devices import DeviceKind, RangeScannerCapabilities
 from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable, Unsupported
 from hal.geometry import UncertainPose
@@ -239,8 +240,9 @@ def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
 def ensure_space_is_known(session: Session) -> None:
     """Look with the range camera for what stands before the panel, unless that was done since it was located.
 
-    A line scanner is not swept for it. Where the camera does not get to see the whole panel, or fails, that is told as
-    progress, and the paths are planned among what the panel file describes.
+    The image from the overview or from where the arm stands will do if it shows the whole panel; otherwise the range camera
+    is driven to face it. A line scanner is not swept for it. Where the camera does not get to see the whole panel, or
+    fails, that is told as progress, and the paths are planned among what the panel file describes.
 
     Raises:
         NotFound: the panel has not been located.
@@ -248,19 +250,42 @@ def ensure_space_is_known(session: Session) -> None:
     """
     if session.world.obstacles is not None or not has_range_camera(session):
         return
+    overview = session.world.overview
     session.world.note_obstacles(())
     session.progress(0.0, "look for what stands before the panel")
     try:
-        name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
-        views = viewpoints.overview_poses(
-            session.known_panel().parent_from_child, session.panel, _as_lens(device.capabilities()), VIEW_SLACK_M
-        )
-        back = session.mount(name).parent_from_child.inv()
-        go_to_first(session, (view * back for view in views), name="face the panel with the scanner", thorough=False)
-        settle(session)
-        session.world.note_obstacles(obstacles_in(session, scan(session)))
+        image = overview if overview is not None and _shows_all(session, overview) else scan(session)
+        if not _shows_all(session, image):
+            _face_all(session)
+            image = scan(session)
+        session.world.note_obstacles(obstacles_in(session, image))
     except (DeviceError, PerceptionError, Unreachable, Unsupported) as error:
         session.progress(1.0, "what stands before the panel is not known", error.what)
+
+
+def _shows_all(session: Session, image: Scan) -> bool:
+    """Return whether the corners of the plate are in a range image."""
+    width_m, height_m = session.panel.width_m, session.panel.height_m
+    corners = [(x * width_m / 2, y * height_m / 2, 0.0) for x in (-1, 1) for y in (-1, 1)]
+    scanner_from_base, lens = image.base_from_scanner.parent_from_child.inv(), _as_lens(image.capabilities)
+    pixels = project(scanner_from_base.apply(session.known_panel().parent_from_child.apply(corners)), lens)
+    # A corner that is not in front of the scanner has NaN for a pixel, which is within nothing.
+    return bool(((pixels >= 0.0) & (pixels <= (lens.width_px - 1, lens.height_px - 1))).all())
+
+
+def _face_all(session: Session) -> None:
+    """Drive the range camera to where it sees the whole panel.
+
+    Raises:
+        Unreachable: the arm reaches no such pose.
+    """
+    name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
+    views = viewpoints.overview_poses(
+        session.known_panel().parent_from_child, session.panel, _as_lens(device.capabilities()), VIEW_SLACK_M
+    )
+    back = session.mount(name).parent_from_child.inv()
+    go_to_first(session, (view * back for view in views), name="face the panel with the scanner", thorough=False)
+    settle(session)
 
 
 def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
@@ -269,7 +294,8 @@ def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
     base_from_scanner, base_from_panel = image.base_from_scanner.parent_from_child, context.panel_pose
     points = sensor.points(np.asarray(image.depth_m, float)).reshape(-1, 3)
     points = base_from_scanner.apply(points[np.isfinite(points).all(axis=1)])
-    x, y, z = (session.mover.state().base_from_flange * context.flange_from_grip).inv().apply(points).T
+    base_from_flange = base_from_scanner * session.mount(image.scanner).parent_from_child.inv()
+    x, y, z = (base_from_flange * context.flange_from_grip).inv().apply(points).T
     is_strange = (points[:, 2] > context.floor_z_m + FLOOR_SLACK_M) & ((z > HAND_M) | (np.hypot(x, y) > 2 * HAND_M))
     found = find_obstacles(
         base_from_panel.inv().apply(points[is_strange]),

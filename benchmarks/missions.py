@@ -1,12 +1,14 @@
-"""Runs and judges whole missions: `python -m benchmarks.missions [FIRST LAST] [--cell FILE] [--panel FILE] [--scanner WAY]`.
+"""Runs and judges whole missions: `python -m benchmarks.missions [FIRST LAST] [--cell FILE] [--panel FILE] [--twice]`.
 
 Every mission runs through the real server, as by `panelwright demo --seed N --judge`. Prints a table of missions, one of
-kinds (readings and actions that were right, wrong, refused or not confirmed) and the pass lines.
+kinds (readings and actions that were right, wrong, refused or not confirmed) and the pass lines. With `--twice` each runs a
+second time in new processes, which must give the same readings, forces, joints and pictures to the last bit.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import tempfile
 import tomllib
@@ -29,6 +31,7 @@ from simbackend.draws import Draws
 from simbackend.panel_state import build
 
 ROOT = Path(__file__).resolve().parents[1]
+PASSING = ("mission", "started", "wall_s")  # of a report: the name with its date, and times on the wall
 HEAD = (
     "| seed | confirmed | judge agrees | pose mm | pose deg | in 95 % | readings right | by surfaces mm "
     "| cell s | wall s | peak N | note |"
@@ -37,11 +40,17 @@ HEAD = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """Judged mission; `places_m` holds where the simulator built each object, (3,) in the base frame."""
+    """Judged mission.
+
+    Attributes:
+        places_m: where the simulator built each object, (3,) in the base frame.
+        digest: a hash of everything in the report that a repetition must give again.
+    """
 
     seed: int
     report: dict[str, Any]
     places_m: dict[str, Array]
+    digest: str
 
     @property
     def judge(self) -> dict[str, Any]:
@@ -88,16 +97,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         choices=("polar", *WIRES),
         help="a line scanner, simulated or by its driver over an emulated wire, in place of the range camera",
     )
+    parser.add_argument("--twice", action="store_true", help="repeat each mission in new processes and compare")
     given = parser.parse_args(arguments)
     if given.last < given.first:
         parser.error(f"the seeds {given.first} to {given.last} are none: FIRST comes before LAST")
     print(f"{HEAD}\n|{' --- |' * 12}", flush=True)
-    runs = []
+    runs, others = [], []
     for seed in range(given.first, given.last + 1):
         runs.append(run(seed, given.cell, given.panel, given.scanner))
         print(runs[-1].row(), flush=True)
+        if given.twice and run(seed, given.cell, given.panel, given.scanner).digest != runs[-1].digest:
+            others.append(seed)
     print(by_kind(runs))
-    return summary(runs)
+    if given.twice:
+        same = f"same bits in new processes: {len(runs) - len(others)} of {len(runs)}"
+        print(f"MISSED {same}; not {others}" if others else f"met    {same}")
+    return max(summary(runs), int(bool(others)))
 
 
 def run(seed: int, cell: Path, panel: Path | None = None, scanner: str | None = None) -> Run:
@@ -116,7 +131,23 @@ def run(seed: int, cell: Path, panel: Path | None = None, scanner: str | None = 
         finally:
             panelwright.close()
         report = json.loads((Path(folder) / name / "report.json").read_text(encoding="utf-8"))
-        return Run(seed=seed, report=report, places_m=built_places(loaded, seed))
+        return Run(
+            seed=seed, report=report, places_m=built_places(loaded, seed), digest=digest_of(Path(folder) / name, report)
+        )
+
+
+def digest_of(folder: Path, report: dict[str, Any]) -> str:
+    """Return a hash of a mission's report and files without its name and the times on the wall."""
+    told = json.dumps(_lasting(report), sort_keys=True)
+    files = sorted(path for path in folder.iterdir() if path.suffix == ".png")
+    parts = [told.encode(), *(path.name.encode() + path.read_bytes() for path in files)]
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
+
+
+def _lasting(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _lasting(item) for key, item in value.items() if key not in PASSING}
+    return [_lasting(item) for item in value] if isinstance(value, list) else value
 
 
 def changed(cell: Path, panel: Path | None, scanner: str | None, folder: Path) -> Path:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,12 +21,14 @@ BEGIN_S = 0.03  # of an older heartbeat the reader begins to watch what the proc
 LOOK_S = 0.06  # an older heartbeat makes the reader ask the operating system for the state of the process
 SILENCE_S = 4.0  # a process that has little of a busy machine may be this late
 PAUSE_S = 180.0  # a declared pause is no longer: one kernel compiles in a minute on a busy machine
-# A silent process that stands still for so long, while its heartbeat asks so often for the lock of Python, hangs.
-STILL_S, WAKES = 0.04, 4
+# A silent process hangs that stands still for so long, while its heartbeat asks for the lock of Python at least this share as
+# often as a thread does that waits for it.
+STILL_S, ASKING_SHARE = 0.04, 0.5
+LEAST_INTERVAL_S = 1e-4  # of asking; where none is told yet, nothing is said to hang
 ASLEEP_S = 1.0  # so does one of which no thread moves for so long; shorter standstills are those of the machine
 COMPUTING_S = {"service": 1.0}  # a silent process may compute for so long: a large answer in JSON takes 0.2 s
 COMPUTING_OTHERS_S = 0.3
-SIZE = 32
+SIZE = 40
 NAMES = ("service", "cell", "stop")
 
 
@@ -50,6 +53,7 @@ class Beat:
         self._pid = memoryview(self._memory)[8:16].cast("Q")
         self._pause_ends_s = memoryview(self._memory)[16:24].cast("d")
         self._thread = memoryview(self._memory)[24:32].cast("Q")
+        self._asks_after_s = memoryview(self._memory)[32:40].cast("d")
 
     def pause(self, begins: bool) -> None:
         """Declare that this process gives no heartbeat for a while, or that it goes on; see `hal.pauses`."""
@@ -62,6 +66,7 @@ class Beat:
     def beat(self) -> None:
         """Write the current time; always called by the same thread, at which readers look when it is late."""
         self._thread[0] = threading.get_native_id()
+        self._asks_after_s[0] = sys.getswitchinterval()
         self._stamp()
 
     def _stamp(self) -> None:
@@ -87,6 +92,7 @@ class Beat:
                 self._pause_ends_s[0]
             )  # read before the heartbeat, which a pause renews
             age_s, pid, thread = self.age_s(), int(self._pid[0]), int(self._thread[0])
+            asks_after_s = float(self._asks_after_s[0])
         except ValueError:
             return None  # closed: this process ends
         if pid == 0 or age_s < BEGIN_S:
@@ -100,7 +106,8 @@ class Beat:
             return str(state)
         if is_paused:
             return None
-        if (did.still_s >= STILL_S and did.wakes >= WAKES) or did.asleep_s >= ASLEEP_S:
+        asking = ASKING_SHARE * did.still_s / max(asks_after_s, LEAST_INTERVAL_S)
+        if (did.still_s >= STILL_S and did.wakes >= asking) or did.asleep_s >= ASLEEP_S:
             return f"hangs: none of its threads has done anything for {age_s:.2f} s"
         if did.computed_s >= self._computing_s or age_s > silence_s:
             return f"gave no sign of life for {age_s:.1f} s"
@@ -112,6 +119,7 @@ class Beat:
         self._pid.release()
         self._pause_ends_s.release()
         self._thread.release()
+        self._asks_after_s.release()
         self._memory.close()
 
 

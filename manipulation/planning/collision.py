@@ -131,19 +131,30 @@ class CollisionModel:
         """Return the names of the two things that are nearest to each other at `q_rad`, for error messages."""
         ends = clearance.capsule_ends(self.kinematics.dh, q_rad, self.tool_ends)
         names = self.capsule_names
-        gaps = {
-            f"{names[i]} and {box.name}": clearance.segment_box(
-                ends[i, 0], ends[i, 1], self.rotations[j], self.middles[j], self.halves[j]
+        gaps = [
+            (
+                clearance.segment_box(ends[i, 0], ends[i, 1], self.rotations[j], self.middles[j], self.halves[j])
+                - self.radii[i],
+                f"{names[i]} and {box.name}",
             )
-            - self.radii[i]
             for i in range(len(names))
             for j, box in enumerate(self.boxes)
             if self.watched[i, j]
-        }
+        ]
         for i, j in self.self_pairs:
             apart = clearance.segment_segment(ends[i, 0], ends[i, 1], ends[j, 0], ends[j, 1])
-            gaps[f"{names[i]} and {names[j]}"] = apart - self.radii[i] - self.radii[j]
-        return min(gaps, key=lambda pair: gaps[pair]) if gaps else "nothing"
+            gaps.append((apart - self.radii[i] - self.radii[j], f"{names[i]} and {names[j]}"))
+        return min(gaps)[1] if gaps else "nothing"
+
+    def distances_m(self, q_rad: Array, points_m: Array) -> Array:
+        """Return how far points (N, 3) of the base frame are from the surface of arm and tool, m, negative inside: (N,)."""
+        starts, ends = np.moveaxis(clearance.capsule_ends(self.kinematics.dh, q_rad, self.tool_ends), 1, 0)
+        least = np.full(len(points_m), np.inf)
+        for start, along, radius in zip(starts, ends - starts, self.radii, strict=True):
+            share = np.clip((points_m - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+            apart = np.linalg.norm(points_m - start - share[:, None] * along, axis=1)
+            least = np.minimum(least, apart - radius)
+        return least
 
     def _separable_pairs(self) -> NDArray[np.int64]:
         """Return the pairs of capsules, not neighbours, that are apart in at least half of all configurations."""

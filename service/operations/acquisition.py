@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.clock import Deadline, WallClock
 from hal.config import Cell
@@ -57,13 +58,17 @@ class LightPair:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scan:
-    """One range image (float32 metres, NaN where nothing was measured), perhaps swept, and the pose of the scanner."""
+    """One range image (float32 metres, NaN where nothing was measured), perhaps swept, and where the scanner stood.
+
+    `position_rad` (n,) are the joints of the arm that carried it.
+    """
 
     depth_m: NDArray[np.float32]
     stamp_s: float
     scanner: str
     capabilities: RangeScannerCapabilities
     base_from_scanner: UncertainPose
+    position_rad: Array
     swept: SweptImage | None = None
 
     def swept_errors(self, mount: UncertainPose) -> SweptErrors | None:
@@ -182,6 +187,7 @@ def scan(session: Session) -> Scan:
             scanner=name,
             capabilities=swept.capabilities,
             base_from_scanner=base_from(session, name),
+            position_rad=session.mover.state().position_rad,
             swept=swept,
         )
     asked_s = session.connection.clock.now_s()
@@ -194,6 +200,7 @@ def scan(session: Session) -> Scan:
         scanner=name,
         capabilities=capabilities,
         base_from_scanner=base_from(session, name),
+        position_rad=session.mover.state().position_rad,
     )
 
 

@@ -12,15 +12,18 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.devices import DeviceKind, RangeScannerCapabilities
 from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable, Unsupported
 from hal.geometry import UncertainPose
 from hal.panel import Cap, Panel, PanelObject
-from manipulation import CollisionBox
+from manipulation import CollisionBox, SkillContext
 from perception.range import (
     PanelScan,
     RangeScene,
@@ -47,6 +50,8 @@ from service.schema.mission_results import SurfaceCheck
 OVERVIEW, CLOSER = "the overview", "a closer look"
 VIEW_SLACK_M = 0.0  # around the panel, in a view of all of it
 FLOOR_SLACK_M, HAND_M = 0.03, 0.05  # what is so near to the floor or the finger tips is the floor or the hand
+EDGE_PX = 2
+ARM_SLACK_M = 0.03  # what is so near to the model of the arm is the arm, which a folded arm's scanner sees
 SURE_ODDS = 6.0  # least logarithm of the odds of a state that a height proves
 
 
@@ -292,11 +297,15 @@ def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
     """Return boxes in the base frame around what a range image shows before the panel; see `find_obstacles`."""
     context, sensor = skill_context(session), image.pinhole()
     base_from_scanner, base_from_panel = image.base_from_scanner.parent_from_child, context.panel_pose
-    points = sensor.points(np.asarray(image.depth_m, float)).reshape(-1, 3)
-    points = base_from_scanner.apply(points[np.isfinite(points).all(axis=1)])
-    base_from_flange = base_from_scanner * session.mount(image.scanner).parent_from_child.inv()
-    x, y, z = (base_from_flange * context.flange_from_grip).inv().apply(points).T
-    is_strange = (points[:, 2] > context.floor_z_m + FLOOR_SLACK_M) & ((z > HAND_M) | (np.hypot(x, y) > 2 * HAND_M))
+    in_scanner = sensor.points(np.asarray(image.depth_m, float))
+    is_measured = np.isfinite(in_scanner).all(axis=-1)
+    points = base_from_scanner.apply(in_scanner[is_measured])
+    is_own = np.zeros(is_measured.shape, bool)
+    is_own[is_measured] = _is_arm_or_hand(session, context, image, points)
+    # A pixel beside the arm may show a mean of the arm and what is behind it, which stands nowhere.
+    is_strange = (points[:, 2] > context.floor_z_m + FLOOR_SLACK_M) & ~binary_dilation(is_own, iterations=EDGE_PX)[
+        is_measured
+    ]
     found = find_obstacles(
         base_from_panel.inv().apply(points[is_strange]),
         session.panel,
@@ -309,6 +318,15 @@ def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
         )
         for one in found
     )
+
+
+def _is_arm_or_hand(session: Session, context: SkillContext, image: Scan, points_m: Array) -> NDArray[np.bool_]:
+    """Return which points (N, 3) of the base frame belong to the arm, or to the hand and what is between its fingers."""
+    base_from_flange = image.base_from_scanner.parent_from_child * session.mount(image.scanner).parent_from_child.inv()
+    x, y, z = (base_from_flange * context.flange_from_grip).inv().apply(points_m).T
+    arm = context.collision(width_m=session.mover.state().gripper_width_m)
+    is_arm = arm.distances_m(image.position_rad, points_m) < ARM_SLACK_M
+    return np.asarray(is_arm | ((z <= HAND_M) & (np.hypot(x, y) <= 2 * HAND_M)))
 
 
 def _as_lens(c: RangeScannerCapabilities) -> CameraIntrinsics:

@@ -63,6 +63,29 @@ def test_a_box_in_the_forearm_is_found_and_named() -> None:
     assert model.with_boxes([box], ignored=[("", "post")]).is_clear(q, margin_m=0.0)
 
 
+def test_of_several_boxes_with_one_name_the_nearest_is_named() -> None:
+    q = np.array([0.0, 0.3, 0.3, 0.0, 0.5, 0.0])
+    near = CollisionBox(
+        name="cable", parent_from_box=transform_rpy(KINEMATICS.flange(q).translation, (0, 0, 0)), half_m=(0.02,) * 3
+    )
+    far = CollisionBox(name="cable", parent_from_box=transform_rpy((5.0, 0.0, 0.0), (0, 0, 0)), half_m=(0.02,) * 3)
+    assert "cable" in CollisionModel.build(KINEMATICS, TOOL, [near, far]).nearest(q)
+
+
+def test_the_distance_of_points_from_the_arm_is_that_of_a_small_box_there() -> None:
+    q, rng = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7]), np.random.default_rng(5)
+    places = KINEMATICS.flange(q).translation + rng.uniform(-0.5, 0.5, (20, 3))
+    model = CollisionModel.build(KINEMATICS, TOOL)
+    boxes = [
+        CollisionBox(name="dot", parent_from_box=transform_rpy(place, (0, 0, 0)), half_m=(1e-6,) * 3)
+        for place in places
+    ]
+    apart = [min(model.with_boxes([box]).clearance_m(q), np.inf) for box in boxes]
+    ours = model.clearance_m(q)  # of the arm from itself
+    for distance, least in zip(model.distances_m(q, places), apart, strict=True):
+        assert min(float(distance), ours) == pytest.approx(least, abs=1e-5)
+
+
 def test_an_ordinary_pose_does_not_touch_itself_and_a_folded_one_does() -> None:
     model = CollisionModel.build(KINEMATICS, TOOL)
     assert model.is_clear(np.array([0.0, 0.2, 0.5, 0.0, 0.9, 0.0]), margin_m=0.01)

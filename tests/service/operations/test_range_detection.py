@@ -102,6 +102,7 @@ def scan_of(depth: np.ndarray, *, seed: int = 3, projection: str = "pinhole") ->
         scanner="range_scanner",
         capabilities=c,
         base_from_scanner=certain(RigidTransform.identity()),
+        position_rad=np.zeros(6),
     )
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from manipulation import CollisionBox, Kinematics
     from manipulation.plausibility import FrameDigest
     from perception.vision import ObjectReading
-    from service.operations.acquisition import Scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,7 +33,6 @@ class Facts:
         frames: newest frame of each camera and range scanner, by the device's name.
         turned_rad: angle with its whole turns, by name, of each wheel that was turned; a look shows one turn only.
         obstacles: boxes in the base frame around what stands before the panel; None until it was looked for.
-        overview: range image from the overview; None if there is none since the panel was last seen to move.
         kinematics: of the cell's arm; None until first needed.
     """
 
@@ -43,7 +41,6 @@ class Facts:
     frames: Mapping[str, FrameDigest] = field(default_factory=lambda: MappingProxyType({}))
     turned_rad: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     obstacles: tuple[CollisionBox, ...] | None = None
-    overview: Scan | None = None
     kinematics: Kinematics | None = None
 
 
@@ -70,7 +67,7 @@ class WorldModel:
 
     def forget_panel(self) -> None:
         """Drop the panel's pose, because the calibration that it was measured with has changed."""
-        self._change(lambda facts: replace(facts, base_from_panel=None, obstacles=None, overview=None))
+        self._change(lambda facts: replace(facts, base_from_panel=None, obstacles=None))
 
     def note_readings(self, readings: Iterable[ObjectReading]) -> None:
         """Store the conclusive readings in place of earlier ones of the same objects."""
@@ -101,18 +98,7 @@ class WorldModel:
 
     def note_obstacles(self, boxes: tuple[CollisionBox, ...] | None) -> None:
         """Store what stands before the panel in place of what was found earlier; None if it is to be looked for again."""
-        self._change(
-            lambda facts: replace(facts, obstacles=boxes, overview=facts.overview if boxes is not None else None)
-        )
-
-    @property
-    def overview(self) -> Scan | None:
-        """The range image from the overview; None if there is none since the panel was last seen to move."""
-        return self._facts.overview
-
-    def note_overview(self, scan: Scan) -> None:
-        """Store the range image from the overview."""
-        self._change(lambda facts: replace(facts, overview=scan))
+        self._change(lambda facts: replace(facts, obstacles=boxes))
 
     def note_frame(self, device: str, frame: FrameDigest) -> FrameDigest | None:
         """Store the newest frame of a sensor; returns the previous one."""

@@ -305,7 +305,6 @@ def _find(session: Session, record: MissionRecord, tolerance: PoseTolerance) -> 
             part.progress(0.0, "scan the plate")
             plane = scan_plate(part)
             _note_plane(record, plane)
-            part.world.note_overview(plane.scan)
             found = replace(found, plane=plane, surfaces=view_surfaces(part, plane, OVERVIEW))
     if _pose_error(session, found.observations, tolerance) > 1.0:
         with _step(session, "square view", 0.13, 0.19) as part:

@@ -18,7 +18,6 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
-from hal.camera_model import project
 from hal.devices import DeviceKind, RangeScannerCapabilities
 from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable, Unsupported
 from hal.geometry import UncertainPose
@@ -245,9 +244,8 @@ def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
 def ensure_space_is_known(session: Session) -> None:
     """Look with the range camera for what stands before the panel, unless that was done since it was located.
 
-    The image from the overview or from where the arm stands will do if it shows the whole panel; otherwise the range camera
-    is driven to face it. A line scanner is not swept for it. Where the camera does not get to see the whole panel, or
-    fails, that is told as progress, and the paths are planned among what the panel file describes.
+    A line scanner is not swept for it. Where the camera does not get to see the whole panel, or fails, that is told as
+    progress, and the paths are planned among what the panel file describes.
 
     Raises:
         NotFound: the panel has not been located.
@@ -255,42 +253,19 @@ def ensure_space_is_known(session: Session) -> None:
     """
     if session.world.obstacles is not None or not has_range_camera(session):
         return
-    overview = session.world.overview
     session.world.note_obstacles(())
     session.progress(0.0, "look for what stands before the panel")
     try:
-        image = overview if overview is not None and _shows_all(session, overview) else scan(session)
-        if not _shows_all(session, image):
-            _face_all(session)
-            image = scan(session)
-        session.world.note_obstacles(obstacles_in(session, image))
+        name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
+        views = viewpoints.overview_poses(
+            session.known_panel().parent_from_child, session.panel, _as_lens(device.capabilities()), VIEW_SLACK_M
+        )
+        back = session.mount(name).parent_from_child.inv()
+        go_to_first(session, (view * back for view in views), name="face the panel with the scanner", thorough=False)
+        settle(session)
+        session.world.note_obstacles(obstacles_in(session, scan(session)))
     except (DeviceError, PerceptionError, Unreachable, Unsupported) as error:
         session.progress(1.0, "what stands before the panel is not known", error.what)
-
-
-def _shows_all(session: Session, image: Scan) -> bool:
-    """Return whether the corners of the plate are in a range image."""
-    width_m, height_m = session.panel.width_m, session.panel.height_m
-    corners = [(x * width_m / 2, y * height_m / 2, 0.0) for x in (-1, 1) for y in (-1, 1)]
-    scanner_from_base, lens = image.base_from_scanner.parent_from_child.inv(), _as_lens(image.capabilities)
-    pixels = project(scanner_from_base.apply(session.known_panel().parent_from_child.apply(corners)), lens)
-    # A corner that is not in front of the scanner has NaN for a pixel, which is within nothing.
-    return bool(((pixels >= 0.0) & (pixels <= (lens.width_px - 1, lens.height_px - 1))).all())
-
-
-def _face_all(session: Session) -> None:
-    """Drive the range camera to where it sees the whole panel.
-
-    Raises:
-        Unreachable: the arm reaches no such pose.
-    """
-    name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
-    views = viewpoints.overview_poses(
-        session.known_panel().parent_from_child, session.panel, _as_lens(device.capabilities()), VIEW_SLACK_M
-    )
-    back = session.mount(name).parent_from_child.inv()
-    go_to_first(session, (view * back for view in views), name="face the panel with the scanner", thorough=False)
-    settle(session)
 
 
 def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:

@@ -123,6 +123,14 @@ class SafetySection(Strict):
 
     force_limit_n: Annotated[float, Field(gt=0, le=500)] = 100.0
     speed_limit_m_per_s: Annotated[float, Field(gt=0, le=2)] = 0.25
+    reduced_speed_m_per_s: Annotated[
+        float,
+        Field(
+            ge=0.02,
+            le=0.25,
+            description="largest speed of the tool's tip while people are near (POST /v1/speed/reduce)",
+        ),
+    ] = 0.1
     lease_ttl_s: Annotated[float, Field(ge=0.1, le=10)] = 2.0
     client_lost: Annotated[
         LossAction,

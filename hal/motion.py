@@ -7,6 +7,7 @@ tool weight subtracted) in tool axes about the tool's origin: the wrench that th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
@@ -74,6 +75,35 @@ class Compliance:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MotionLimits:
+    """Limits of one motion besides those of the cell, of which the stricter holds; None sets none.
+
+    Attributes:
+        speed_m_per_s: largest speed of the tool's tip. The motion is made more slowly, along the same way.
+        force_n: largest contact force.
+    """
+
+    speed_m_per_s: float | None = None
+    force_n: float | None = None
+
+
+NO_LIMITS = MotionLimits()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellSignals:
+    """What the control thread asks in each tick besides the stop latch.
+
+    Attributes:
+        is_reduced: whether people are near, so that the reduced speed holds.
+        keeps_power: whether a latched stop leaves the drives on, so that they hold the arm.
+    """
+
+    is_reduced: Callable[[], bool] = lambda: False
+    keeps_power: Callable[[], bool] = lambda: False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GripperMotion:
     """Move the pads while the arm holds its pose or makes a trajectory; ends when they rest or after `timeout_s`.
 
@@ -89,6 +119,7 @@ class GripperMotion:
     must_arrive: bool = True
     guards: tuple[Guard, ...] = ()
     is_retreat: bool = False
+    limits: MotionLimits = NO_LIMITS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,6 +137,7 @@ class JointTrajectory:
     guards: tuple[Guard, ...] = ()
     pads: GripperMotion | None = None
     is_retreat: bool = False
+    limits: MotionLimits = NO_LIMITS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,6 +158,7 @@ class CartesianPath:
     guards: tuple[Guard, ...] = ()
     compliance: Compliance | None = None
     is_retreat: bool = False
+    limits: MotionLimits = NO_LIMITS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,6 +168,7 @@ class Hold:
     name: str
     duration_s: float
     guards: tuple[Guard, ...] = ()
+    limits: MotionLimits = NO_LIMITS
 
 
 DeclaredMotion = JointTrajectory | CartesianPath | Hold | GripperMotion

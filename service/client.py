@@ -115,7 +115,7 @@ class Client:
         """Return the JSON answer to a POST request; errors as for `get`."""
         return self._json(self.fetch("POST", path, body, headers=headers))
 
-    def stop(self) -> Any:
+    def stop(self, level: str = "off") -> Any:
         """Latch the software stop through the service or, when that does not answer at once, through its stop process.
 
         The stop process is expected on the next port, which is the default of `serve`; if `--stop-port` chose another, make a
@@ -127,13 +127,13 @@ class Client:
         """
         url = self._address()
         try:
-            return replace(self, timeout_s=STOP_WAIT_S).post("/v1/stop")
+            return replace(self, timeout_s=STOP_WAIT_S).post(f"/v1/stop?level={level}")
         except DeviceUnavailable as error:
             beside = url.copy_with(
                 scheme="http", port=(url.port or 80) + 1
             )  # the stop port has no TLS and needs no key
             try:
-                return Client(url=str(beside), timeout_s=STOP_WAIT_S).post("/v1/stop")
+                return Client(url=str(beside), timeout_s=STOP_WAIT_S).post(f"/v1/stop?level={level}")
             except CellError:
                 raise DeviceUnavailable(
                     f"{error.what}; nor does a stop process on the next port",

@@ -28,6 +28,7 @@ from service.knowledge.calibrations import Calibrations
 from service.operations import Operation, OperationContext
 from service.plant import Plant
 from service.processes.device_slots import IN_MOTION
+from service.processes.speed_desk import SpeedDesk
 from service.processes.stop_desk import Records
 from service.processes.supervisor import Supervisor
 from service.rounds.cell import RunningCell
@@ -101,6 +102,7 @@ class Service:
             record=None if self.recording is None else self.recording.endpoint,
             replay=replay,
         )
+        self.speed = SpeedDesk(self.supervisor.latch, state_dir / "reduced-speed", self.commit)
         self.losses = Losses(cell, stop=self.stop_quietly)
         self.journal_watch = JournalWatch(self.journal, self._on_no_record)
         recorder = self.journal if self.recording is None else self.recording.recorder(self.journal)

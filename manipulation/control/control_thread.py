@@ -36,7 +36,7 @@ class ControlThread:
         at_end: called by the thread just before it ends.
     """
 
-    def __init__(self, *, beat: Callable[[], None] | None, at_end: Callable[[], None]) -> None:
+    def __init__(self, *, beat: Callable[[], None] | None, at_end: Callable[[], object]) -> None:
         self._beat = beat
         self._at_end = at_end
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()

@@ -22,6 +22,7 @@ from hal.errors import CellError, DeviceFault, MotionRefused, Stopped
 from hal.geometry import identity
 from hal.motion import (
     CartesianPath,
+    CellSignals,
     DeclaredMotion,
     MotionOutcome,
     MotionReport,
@@ -45,6 +46,7 @@ from manipulation.control.sensing import (
     ToolReading,
     ToolView,
     refuse,
+    state_of,
 )
 from manipulation.control.setpoint import SetPointLimiter, check, check_is_felt, flange_matrix, is_retreat
 from manipulation.control.termination import (
@@ -53,6 +55,7 @@ from manipulation.control.termination import (
     cause_of_end,
     force_limit_n,
     has_settled,
+    speed_limit_m_per_s,
 )
 from manipulation.plausibility.hand import TouchMonitor
 from manipulation.plausibility.repetition import RepeatedWrench
@@ -69,6 +72,7 @@ class Controller:
         safety: force and speed limits that hold in every motion.
         load: mass and centre of mass of what hangs below the sensor, and the sensor's bias, which `tare` corrects.
         is_latched: reads the stop latch; called every tick.
+        signals: read every tick, too.
         flange_from_grip: the tool of motions that name none.
         rate_hz: control rate; None takes the arm's.
     """
@@ -82,6 +86,7 @@ class Controller:
         load: ToolLoad,
         flange_from_sensor: RigidTransform,
         is_latched: Callable[[], bool],
+        signals: CellSignals | None = None,
         flange_from_grip: RigidTransform | None = None,
         rate_hz: float | None = None,
     ) -> None:
@@ -108,6 +113,7 @@ class Controller:
         self._safety = safety
         self._contact = ContactWrench(load, flange_from_sensor)
         self._is_latched = is_latched
+        self._signals = signals or CellSignals()
         self._grip = flange_matrix(identity() if flange_from_grip is None else flange_from_grip)
         self._dt_s = 1.0 / (rate_hz or capabilities.command_rate_hz)
         self._filter = SetPointLimiter(self.kinematics, self._grip, safety.speed_limit_m_per_s, self._dt_s)
@@ -119,6 +125,7 @@ class Controller:
         self._cancel = threading.Event()
         self._newest: Sample | None = None
         self._faults: tuple[str, ...] = ()
+        self._not_stopped: tuple[str, ...] = ()
         self._is_moving = False
         self._is_closing = False
 
@@ -188,12 +195,16 @@ class Controller:
             sample = self._thread.do(self._refresh)
         return self._state_of(sample)
 
+    def not_stopped(self) -> tuple[str, ...]:
+        """Return which devices did not do what the last stop or early end asked of them, and why; asks no device."""
+        return self._not_stopped
+
     # -- between motions -------------------------------------------------------------------------------------------
 
     def _hold(self) -> None:
         """Run one tick between motions on a wall clock: hold the arm, serve its watchdog and refresh the state."""
         if self._is_latched():  # checked before reading: the drives must go off even if a device is dead
-            self._drives.switch_off()
+            self._stop_drives()
         with suppress(DeviceFailure):
             sample = self._read()
             if self._drives.are_on:
@@ -281,7 +292,12 @@ class Controller:
                                 run.pads.check_end(sample)
                                 self._touch_monitor.pads_moved(run.pads.begun_m, sample.pads)
                             return Termination(outcome=MotionOutcome.COMPLETED, cause=cause_of_end(motion, left_rad))
-                    self._send(self._filter.apply(wanted))
+                    self._filter.slow_to(
+                        speed_limit_m_per_s(motion, self._safety, is_reduced=self._signals.is_reduced())
+                    )
+                    out = self._filter.apply(wanted)
+                    late_s += self._dt_s * self._filter.waiting_share(wanted, out)
+                    self._send(out)
                     self._drives.pass_tick()
                     ticks += 1
                     before_s = sample.stamp_s
@@ -292,24 +308,26 @@ class Controller:
             except DeviceFailure as failure:
                 end = Termination(outcome=MotionOutcome.FAULT, cause=str(failure), device=failure.device)
             self._come_to_rest(end)  # first, because a gripper that hangs must not keep the arm from its rest
-            if run.pads is not None:
-                run.pads.halt(self._newest or sample, elapsed_s)
+            if run.pads is not None and (why := run.pads.halt(self._newest or sample, elapsed_s)) is not None:
+                self._not_stopped = (*self._not_stopped, why)
             return end
 
     def _come_to_rest(self, end: Termination) -> None:
         """Decelerate at the limit, then hold; only the arm is used, because another device may have failed."""
         if end.device is not None:
             self._faults = (end.cause,)
+        self._not_stopped = ()
         try:
             while True:
                 self._send(self._filter.brake())
                 self._drives.pass_tick()
                 if self._filter.is_at_rest:
                     break
-        except DeviceFailure:
+        except DeviceFailure as failure:
+            self._not_stopped = (str(failure),)
             self._drives.switch_off()
         if end.outcome is MotionOutcome.STOPPED:
-            self._drives.switch_off()
+            self._stop_drives()
         self._standing.give_up(end.device)
         with suppress(DeviceFailure):
             self._newest = self._read(is_tolerant=True)
@@ -354,6 +372,11 @@ class Controller:
         tip_m = look.base_from_tool[:3, 3]
         refuse(self._touch_monitor.note(sample.contacts, look.wrench, tip_m, stamp_s=sample.stamp_s))
 
+    def _stop_drives(self) -> None:
+        """Switch the drives off, unless the stop leaves them on so that they hold the arm."""
+        if not self._signals.keeps_power() and (why := self._drives.switch_off()) is not None:
+            self._not_stopped = (*self._not_stopped, why)
+
     def _send(self, position_rad: Array) -> None:
         self._filter.sent(self._drives.send(position_rad))
 
@@ -361,40 +384,16 @@ class Controller:
         self, motion: DeclaredMotion, end: Termination, started_s: float, view: ToolView, recorder: Recorder
     ) -> MotionReport:
         sample = self._newest
-        n = len(self.kinematics.dh)
-        q, wrench, pose = np.zeros(n), np.zeros(6), identity()
-        if sample is not None:
-            look = view.look(sample, self._filter.last_rad)
-            q, wrench, pose = sample.position_rad, look.wrench, RigidTransform.from_matrix(look.base_from_tool)
-        return MotionReport(
-            name=motion.name,
-            outcome=end.outcome,
-            tripped=end.tripped,
-            cause="; ".join((end.cause, *(f"without {one}" for one in self._faults if is_retreat(motion)))),
-            started_s=started_s,
-            ended_s=self._clock.now_s(),
-            position_rad=q,
-            base_from_tool=pose,
-            wrench=wrench,
-            peak_force_n=recorder.peak_force_n,
-            gripper_width_m=None if sample is None else sample.gripper_width_m,
-            log=recorder.log(n),
-            device=end.device,
-            force=recorder.force,
+        return recorder.report(
+            motion,
+            end,
+            sample,
+            None if sample is None else view.look(sample, self._filter.last_rad),
+            span_s=(started_s, self._clock.now_s()),
+            without=self._faults if is_retreat(motion) else (),
+            joints=len(self.kinematics.dh),
         )
 
     def _state_of(self, sample: Sample) -> RobotState:
-        flange = arm_kernels.frames(self.kinematics.dh, sample.position_rad)[-1]
-        return RobotState(
-            stamp_s=sample.stamp_s,
-            position_rad=sample.position_rad,
-            velocity_rad_per_s=sample.velocity_rad_per_s,
-            base_from_flange=RigidTransform.from_matrix(flange),
-            wrench=self._contact.in_flange(sample.raw_wrench, flange) if sample.is_felt else np.zeros(6),
-            contacts=sample.contacts,
-            proximity_m=sample.proximity_m,
-            gripper_width_m=sample.gripper_width_m,
-            is_moving=self._is_moving,
-            is_stopped=self._is_latched(),
-            faults=self._faults,
-        )
+        given = {"is_moving": self._is_moving, "is_stopped": self._is_latched()}
+        return state_of(sample, self._contact, self.kinematics.dh, faults=self._faults, **given)

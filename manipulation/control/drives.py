@@ -35,20 +35,25 @@ class Drives:
             raise failure_of(self._arm.name, error) from error
         self.are_on = True
 
-    def switch_off(self) -> None:
-        """Switch the drives off if they are on, because the stop is latched or the arm does not answer."""
-        if self.are_on:
-            self.stop()
+    def switch_off(self) -> str | None:
+        """Switch the drives off if they are on, because the stop is latched or the arm does not answer; see `stop`."""
+        why = self.stop() if self.are_on else None
         self.are_on = False
+        return why
 
-    def stop(self) -> None:
-        """Ask the arm to stop in any state; an arm that does not receive this stops by its own watchdog."""
+    def stop(self) -> str | None:
+        """Ask the arm to stop in any state; returns why it did not, None if it did.
+
+        An arm that does not receive this stops by its own watchdog.
+        """
         try:
             self._arm.stop(deadline=Deadline.after(self._clock, command_wait_s(self._clock)))
-        except CellError:
-            pass
-        except Exception:  # a defect of the driver must not keep the caller from stopping the rest
+        except CellError as error:
+            return f"{self._arm.name}: {error.what}"
+        except Exception as defect:  # a defect of the driver must not keep the caller from stopping the rest
             log.exception("stopping %s", self._arm.name)
+            return f"{self._arm.name}: {type(defect).__name__}: {defect}"
+        return None
 
     def send(self, position_rad: Array) -> Array:
         """Send a set-point (n,), rad, and return the one that the arm accepted.

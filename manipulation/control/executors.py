@@ -240,16 +240,21 @@ class GripperExecutor:
             width_m=width_m, force_n=wanted.force_n, speed_m_per_s=wanted.speed_m_per_s, deadline=deadline
         )
 
-    def halt(self, sample: Sample, elapsed_s: float) -> None:
-        """Stop the pads where they are, unless they rest already: an early end of the motion applies to them too."""
+    def halt(self, sample: Sample, elapsed_s: float) -> str | None:
+        """Stop the pads where they are, unless they rest already: an early end of the motion applies to them too.
+
+        Returns why they were not stopped, None if they were.
+        """
         if not sample.gripper_is_moving and elapsed_s >= GRIP_START_S:
-            return
+            return None
         try:
             self._move_to(sample.gripper_width_m)
-        except CellError:
-            pass  # the gripper may be the device that failed
-        except Exception:  # a defect of the driver must not keep the arm from coming to rest
+        except CellError as error:  # the gripper may be the device that failed
+            return f"{self._gripper.name}: {error.what}"
+        except Exception as defect:  # a defect of the driver must not keep the arm from coming to rest
             log.exception("halting %s", self._gripper.name)
+            return f"{self._gripper.name}: {type(defect).__name__}: {defect}"
+        return None
 
     def check_end(self, sample: Sample) -> None:
         """Check that pads which hold nothing have reached the width that they were sent to.

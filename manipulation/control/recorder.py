@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.motion import ContactForce, MotionLog
+from hal.geometry import identity
+from hal.motion import ContactForce, DeclaredMotion, MotionLog, MotionReport
+from manipulation.control.sensing import Sample, ToolReading
+from manipulation.control.termination import Termination
 
 LOG_RATE_HZ = 125.0
 CONTACT_N = 3.0  # a smaller force may be noise, drift or the inertia of the hand
@@ -63,4 +67,40 @@ class Recorder:
             wrench=np.array(wrenches),
             tip_m=np.array(tips),
             started_s=self.started_s,
+        )
+
+    def report(
+        self,
+        motion: DeclaredMotion,
+        end: Termination,
+        sample: Sample | None,
+        look: ToolReading | None,
+        *,
+        span_s: tuple[float, float],
+        without: tuple[str, ...],
+        joints: int,
+    ) -> MotionReport:
+        """Return what really happened.
+
+        Args:
+            sample, look: the newest ones, if there are any.
+            span_s: start and end of the motion on the cell's clock.
+            without: the sensors that failed in it and did not end it.
+            joints: number of the arm's joints.
+        """
+        return MotionReport(
+            name=motion.name,
+            outcome=end.outcome,
+            tripped=end.tripped,
+            cause="; ".join((end.cause, *(f"without {one}" for one in without))),
+            started_s=span_s[0],
+            ended_s=span_s[1],
+            position_rad=np.zeros(joints) if sample is None else sample.position_rad,
+            base_from_tool=identity() if look is None else RigidTransform.from_matrix(look.base_from_tool),
+            wrench=np.zeros(6) if look is None else look.wrench,
+            peak_force_n=self.peak_force_n,
+            gripper_width_m=None if sample is None else sample.gripper_width_m,
+            log=self.log(joints),
+            device=end.device,
+            force=self.force,
         )

@@ -16,7 +16,9 @@ from hal.calibration import ToolLoad
 from hal.clock import Clock, Deadline, PacedClock, SimClock
 from hal.devices import Arm, ForceTorque, Gripper, JointState, Proximity, Touch
 from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
+from hal.motion import RobotState
 from hal.readings import Cause, Quality, Stamped
+from manipulation.arm.kernels import frames
 from manipulation.control import kernels
 from manipulation.plausibility.finding import Finding
 from manipulation.plausibility.hand import Pads
@@ -305,6 +307,26 @@ class ContactWrench:
         """Return the contact wrench (6,) in flange axes about the flange."""
         contact = raw_wrench - self.bias - self.weight(base_from_flange)
         return np.asarray(kernels.wrench_at(contact, self.flange_from_sensor))
+
+
+def state_of(
+    sample: Sample, contact: ContactWrench, dh: Array, *, is_moving: bool, is_stopped: bool, faults: tuple[str, ...]
+) -> RobotState:
+    """Return the snapshot that readers of the state get."""
+    flange = frames(dh, sample.position_rad)[-1]
+    return RobotState(
+        stamp_s=sample.stamp_s,
+        position_rad=sample.position_rad,
+        velocity_rad_per_s=sample.velocity_rad_per_s,
+        base_from_flange=RigidTransform.from_matrix(flange),
+        wrench=contact.in_flange(sample.raw_wrench, flange) if sample.is_felt else np.zeros(6),
+        contacts=sample.contacts,
+        proximity_m=sample.proximity_m,
+        gripper_width_m=sample.gripper_width_m,
+        is_moving=is_moving,
+        is_stopped=is_stopped,
+        faults=faults,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

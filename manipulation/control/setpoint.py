@@ -23,6 +23,8 @@ START_M = 0.005
 SPEED_SLACK = 1.05
 RESTING_RAD_PER_S = 1e-4
 BY_CONTACT = (Quantity.FORCE, Quantity.TORQUE, Quantity.FORCE_RISE)
+SLOWING_M_PER_S2 = 2.0  # a lower limit of the tip's speed takes effect at this rate, so that the arm can follow it
+BEHIND_M, BEHIND_TICKS = 0.002, 3  # a set-point that is so far behind the wanted one lets the motion's time stand still
 LOOK_BACK_TICKS = 3  # with one, a jitter of 10 % in the ticks triples the following error of a steady motion
 
 
@@ -30,6 +32,9 @@ class SetPointLimiter:
     """Keeps set-points finite and within joint range, speed, acceleration, tip speed and workspace.
 
     It also keeps the set-point that was sent last.
+
+    Args:
+        tip_limit_m_per_s: that of the cell, for which motions are planned; `slow_to` sets a lower one.
     """
 
     def __init__(
@@ -42,7 +47,7 @@ class SetPointLimiter:
     ) -> None:
         self._kinematics = kinematics
         self._tool = flange_from_tool
-        self._tip_limit = tip_limit_m_per_s
+        self._full_m_per_s = self._tip_limit = tip_limit_m_per_s
         self._workspace = Workspace(workspace, kinematics, flange_from_tool, dt_s)
         self._dt_s = dt_s
         self._wanted_rad = np.zeros((LOOK_BACK_TICKS, len(kinematics.dh)))  # newest first
@@ -66,6 +71,23 @@ class SetPointLimiter:
         out = self._step(wanted_rad)
         self._workspace.check(self.last_rad, out)
         return out
+
+    def slow_to(self, limit_m_per_s: float) -> None:
+        """Bring the limit of the tip's speed one tick nearer to a new one; at rest it holds at once."""
+        limit = min(limit_m_per_s, self._full_m_per_s)
+        change = np.inf if self.is_at_rest else SLOWING_M_PER_S2 * self._dt_s
+        self._tip_limit = float(np.clip(limit, self._tip_limit - change, self._tip_limit + change))
+
+    def waiting_share(self, wanted_rad: Array, out_rad: Array) -> float:
+        """Return the share of a tick for which the motion's time must stand still, so that the set-point stays on its way.
+
+        Below the speed for which a motion is planned, its set-points would run ahead and the arm would cut its corners.
+        """
+        if self._tip_limit >= self._full_m_per_s:
+            return 0.0
+        behind = self._workspace.tip_m(wanted_rad) - self._workspace.tip_m(out_rad)
+        most_m = max(BEHIND_M, BEHIND_TICKS * self._full_m_per_s * self._dt_s)
+        return min(1.0, float(np.linalg.norm(behind)) / most_m)
 
     def _step(self, wanted_rad: Array) -> Array:
         kin = self._kinematics

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.arrays import Array
+from hal.config import SafetySection
 from hal.motion import (
     STOPPING_S,
     DeclaredMotion,
@@ -117,8 +118,19 @@ class TerminationMonitor:
 
 
 def force_limit_n(motion: DeclaredMotion, cell_limit_n: float) -> float:
-    """Return the largest contact force of a motion: the cell's own limit, or less in a transfer through free space."""
-    return min(cell_limit_n, TRANSFER_FORCE_N) if isinstance(motion, JointTrajectory) else cell_limit_n
+    """Return the largest contact force of a motion: that of the cell or its own, or less in a transfer through free space."""
+    limit_n = cell_limit_n if motion.limits.force_n is None else min(cell_limit_n, motion.limits.force_n)
+    return min(limit_n, TRANSFER_FORCE_N) if isinstance(motion, JointTrajectory) else limit_n
+
+
+def speed_limit_m_per_s(motion: DeclaredMotion, safety: SafetySection, *, is_reduced: bool) -> float:
+    """Return the largest speed of the tip: that of the cell, of the motion or, while people are near, the reduced one."""
+    limits = [safety.speed_limit_m_per_s]
+    if is_reduced:
+        limits.append(safety.reduced_speed_m_per_s)
+    if motion.limits.speed_m_per_s is not None:
+        limits.append(motion.limits.speed_m_per_s)
+    return min(limits)
 
 
 def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:

@@ -91,12 +91,17 @@ def _words(event: dict[str, Any]) -> str:
 def stop(
     url: Url = UrlDefault,
     reset: Annotated[bool, typer.Option("--reset", help="Clear the stop instead; this moves nothing.")] = False,
+    hold: Annotated[bool, typer.Option("--hold", help="Leave the drives on, so that they hold the arm.")] = False,
 ) -> None:
     """Latch the software stop of a running service (not a safety function)."""
+    level = "hold" if hold else "off"
     client = client_of(url)
     if reset:
         seen = client.get("/v1/stop")["count"]
         state = client.post("/v1/stop/reset", {"seen_count": seen})
     else:
-        state = client.stop()
-    console.print("the stop is [red]latched[/]" if state["is_latched"] else "the stop is clear")
+        state = client.stop(level)
+    how = ", the drives stay on" if state.get("level") == "hold" else ""
+    console.print(f"the stop is [red]latched[/]{how}" if state["is_latched"] else "the stop is clear")
+    for why in state.get("not_stopped", ()):
+        console.print(f"  [red]not stopped[/]  {escape(why)}")

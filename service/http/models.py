@@ -240,7 +240,21 @@ class StopView(BaseModel):
     count: Annotated[int, Field(description="increases with each change")]
     changed_time_s: float
     source: str
+    level: Annotated[
+        str,
+        Field(description="off: the drives are switched off when the arm is at rest; hold: they stay on and hold it"),
+    ]
+    not_stopped: Annotated[
+        list[str], Field(description="devices that did not obey the newest stop of a motion, each with the cause")
+    ]
     stop_url: Annotated[str, Field(description="address of the stop process, which stops fastest")]
+
+
+class SpeedView(BaseModel):
+    """The speed limit of the tool's tip that holds now."""
+
+    is_reduced: Annotated[bool, Field(description="whether the reduced speed holds, because people are near")]
+    limit_m_per_s: float
 
 
 class ResetRequest(Strict):

@@ -94,8 +94,8 @@ class AppState:
         await self.act(functools.partial(self.service.commit, kind, data))
 
     async def stop(self, work: Callable[[], T]) -> T:
-        """Run work that stops outside the event loop; only other stops may delay it."""
-        return await asyncio.get_running_loop().run_in_executor(self.stop_pool, _in_this_context(work))
+        """Run work that stops outside the event loop; only other stops may delay it, and its caller cannot cancel it."""
+        return await asyncio.shield(asyncio.get_running_loop().run_in_executor(self.stop_pool, _in_this_context(work)))
 
 
 def _in_this_context(work: Callable[[], T]) -> Callable[[], T]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from hal.atomic_write import write_atomically
 from hal.errors import InvalidRequest
+from hal.motion import MotionLimits
 from hal.strict import validate
 from service.schema.mission_file import CallStep, ChooseStep, MissionFile, RepeatStep, Step
 
@@ -40,6 +41,13 @@ class Progress:
     def all_steps(self) -> Iterator[Step]:
         """Yield every step of the mission once, also those within steps and in called missions."""
         yield from _steps_in(self.mission.steps, self.library)
+
+    def limits(self) -> MotionLimits:
+        """Return the limits of all motions: of those of the mission and of the missions that it calls, the strictest."""
+        given = [file.limits for file in (self.mission, *self.library.values())]
+        speeds = [one.speed_m_per_s for one in given if one.speed_m_per_s is not None]
+        forces = [one.force_n for one in given if one.force_n is not None]
+        return MotionLimits(speed_m_per_s=min(speeds, default=None), force_n=min(forces, default=None))
 
     def is_done(self, step: str) -> bool:
         """Return whether the step with that path was finished."""

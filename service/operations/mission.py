@@ -84,7 +84,7 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
     )
     progress.path = context.runs_dir / name / FILE
     progress.save()
-    session = Session(context=context, record=record)
+    session = Session(context=replace(context, limits=progress.limits()), record=record)
     worker = _Worker(session=session, record=record, leaves=leaves_of(progress))
     interpreter = Interpreter(hands=worker, progress=progress)
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hal.arrays import Array
@@ -13,7 +13,7 @@ from hal.devices import DeviceKind
 from hal.errors import ConfigError, DeviceFault, InvalidRequest, MotionError, NotFound, Stopped
 from hal.frames import frame_tree
 from hal.geometry import UncertainPose, identity
-from hal.motion import DeclaredMotion, Hold, MotionOutcome, MotionReport, Mover, RobotState
+from hal.motion import NO_LIMITS, DeclaredMotion, Hold, MotionLimits, MotionOutcome, MotionReport, Mover, RobotState
 from hal.panel import Panel
 from service.history.observer import NoObserver, Observer
 from service.processes.connection import CellConnection
@@ -27,13 +27,17 @@ PAUSE_HOLD_S = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OperationContext:
-    """The inputs of every operation; missions write their reports into `runs_dir`; `observer` keeps what is read."""
+    """The inputs of every operation; missions write their reports into `runs_dir`; `observer` keeps what is read.
+
+    `limits` hold in each motion.
+    """
 
     connection: CellConnection
     task: TaskContext
     runs_dir: Path
     world: WorldModel = field(default_factory=WorldModel)
     observer: Observer = field(default_factory=NoObserver)
+    limits: MotionLimits = NO_LIMITS
 
 
 class NotedMover:
@@ -46,7 +50,7 @@ class NotedMover:
     def execute(self, motion: DeclaredMotion) -> MotionReport:
         """Execute the motion; see `hal.motion.Mover.execute`."""
         self._session.context.task.check_cancelled()
-        report = self._mover.execute(motion)
+        report = self._mover.execute(replace(motion, limits=self._session.context.limits))
         self._session.note(report)
         return report
 

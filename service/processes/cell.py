@@ -20,6 +20,7 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceError
 from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
+from hal.motion import CellSignals
 from hal.process_state import MOVES, set_memory_priority
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
@@ -72,6 +73,7 @@ class CellRuntime:
         cell: Cell,
         *,
         is_latched: Callable[[], bool],
+        signals: CellSignals | None = None,
         swapped: Mapping[str, DeviceSection] | None = None,
         runs_dir: Path | None = None,
         partial: bool = False,
@@ -81,10 +83,9 @@ class CellRuntime:
         """Start the emulators, connect all devices in parallel, then start the control thread.
 
         Args:
-            is_latched: whether the software stop is latched; called by the control thread at each tick.
+            is_latched: whether the software stop is latched; called by the control thread at each tick, as `signals` are.
             swapped: device sections that replace those of the cell file, for example from before a restart.
-            runs_dir: folder in which `panelwright calibrate` keeps its records. Motion uses these; the devices use the
-                records of the cell file.
+            runs_dir: folder of the records of `panelwright calibrate`, which motion uses; devices use those of the cell file.
             partial: whether to continue without devices that do not connect; an invalid cell file is refused in any case.
             report: called when an isolated driver stops or restarts, and for each device that is `MISSING`.
             record: the recorder to which every call of the devices, the mover and the clock is told.
@@ -117,12 +118,12 @@ class CellRuntime:
             objects: dict[str, Any] = {**slots, **behind, PREFIX + CLOCK: clock}
             tap = _tap(record, clock, report, closers)
             used = tap.for_control(slots) if tap else slots
-            motion = _motion(cell, used, clock=clock, runs_dir=runs_dir, is_latched=is_latched)
+            motion = _motion(cell, used, clock=clock, runs_dir=runs_dir, is_latched=is_latched, signals=signals)
             if motion is not None:
                 objects[PREFIX + MOVER] = motion
                 closers.append(motion.close)
-            swapper = Swapper(cell, connect=connect, complete=complete, slots=slots, motion=motion)
-            objects = {**(tap.begin(objects) if tap else objects), PREFIX + SWAPPER: swapper}
+            objects = tap.begin(objects) if tap else objects
+            objects[PREFIX + SWAPPER] = Swapper(cell, connect=connect, complete=complete, slots=slots, motion=motion)
         except BaseException:
             _close_all(closers)
             raise
@@ -135,13 +136,19 @@ class CellRuntime:
 
 
 def _motion(
-    cell: Cell, slots: Mapping[str, Any], *, clock: Clock, runs_dir: Path | None, is_latched: Callable[[], bool]
+    cell: Cell,
+    slots: Mapping[str, Any],
+    *,
+    clock: Clock,
+    runs_dir: Path | None,
+    is_latched: Callable[[], bool],
+    signals: CellSignals | None,
 ) -> MotionPort | None:
     """Start the control thread with the calibrations measured here; returns None for a cell without an arm."""
     if not cell.names_of(DeviceKind.ARM):
         return None
     measured = cell if runs_dir is None else Calibrations.of_runs(runs_dir, cell).applied()
-    return start_controller(measured, slots, clock=clock, is_latched=is_latched)
+    return start_controller(measured, slots, clock=clock, is_latched=is_latched, signals=signals)
 
 
 def _tap(record: Endpoint | None, clock: Clock, report: Report, closers: list[Callable[[], None]]) -> Tap | None:
@@ -277,15 +284,25 @@ def main() -> None:
     with Latch(folder / LATCH) as latch:
         is_orphan = threading.Event()
         _in_background(lambda: _end_with_parent(lifeline, is_orphan))
+
+        def is_lost() -> bool:
+            return is_orphan.is_set() or vigil.is_alone
+
+        signals = CellSignals(is_reduced=latch.is_reduced, keeps_power=lambda: latch.keeps_power() and not is_lost())
         try:
-            _run(order, lifeline, lambda: is_orphan.is_set() or vigil.is_alone or latch.is_set(), is_orphan, vigil)
+            _run(order, lifeline, lambda: is_lost() or latch.is_set(), signals, is_orphan, vigil)
         except CellError as error:
             lifeline.write_line(error_to_line(error))
     kill_own_group()
 
 
 def _run(
-    order: CellOrder, lifeline: Lifeline, is_latched: Callable[[], bool], end: threading.Event, vigil: Vigil
+    order: CellOrder,
+    lifeline: Lifeline,
+    is_latched: Callable[[], bool],
+    signals: CellSignals,
+    end: threading.Event,
+    vigil: Vigil,
 ) -> None:
     from hal.host import serve
 
@@ -295,6 +312,7 @@ def _run(
     runtime = CellRuntime.start(
         cell,
         is_latched=is_latched,
+        signals=signals,
         swapped=swapped,
         runs_dir=runs_dir,
         partial=order.partial,

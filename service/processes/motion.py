@@ -11,12 +11,12 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.calibration import ToolLoad
-from hal.clock import Clock, SimClock
+from hal.clock import Clock, Deadline, SimClock
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, MotionRefused
 from hal.geometry import identity
-from hal.motion import DeclaredMotion, MotionReport, RobotState
+from hal.motion import CellSignals, DeclaredMotion, MotionReport, RobotState
 from hal.readings import Quality
 from service.processes.device_slots import IN_MOTION, DeviceSlot, UnavailableDevice
 
@@ -47,6 +47,10 @@ class Standstill:
 
     def cancel(self) -> None:
         """Do nothing, because no motion runs."""
+
+    def not_stopped(self) -> tuple[str, ...]:
+        """Return nothing, because nothing moves."""
+        return ()
 
     def close(self) -> None:
         """Do nothing, because there is no control thread."""
@@ -105,6 +109,10 @@ class MotionPort:
             return replace(newest, is_stopped=self._is_latched(), faults=self._failing())
         self._newest = self._read()
         return self._newest
+
+    def not_stopped(self, *, deadline: Deadline) -> tuple[str, ...]:  # noqa: ARG002 - of the caller's waiting
+        """Return which devices did not obey the last stop, and why; asks no device."""
+        return self._controller.not_stopped()
 
     def _read(self) -> RobotState:
         is_free = self._devices_in_use.acquire(blocking=False)
@@ -166,7 +174,12 @@ class MotionPort:
 
 
 def start_controller(
-    cell: Cell, devices: Mapping[str, DeviceSlot], *, clock: Clock, is_latched: Callable[[], bool]
+    cell: Cell,
+    devices: Mapping[str, DeviceSlot],
+    *,
+    clock: Clock,
+    is_latched: Callable[[], bool],
+    signals: CellSignals | None = None,
 ) -> MotionPort:
     """Start the control thread for the cell's devices and return its port; errors as for `controller_of`."""
     used = {name: devices[name] for name, section in cell.file.devices.items() if section.kind in IN_MOTION}
@@ -175,7 +188,7 @@ def start_controller(
         for slot in used.values():
             if isinstance(absent := slot.installed(), UnavailableDevice):
                 return Standstill(absent.why)
-        return controller_of(cell, devices, clock=clock, is_latched=is_latched)
+        return controller_of(cell, devices, clock=clock, is_latched=is_latched, signals=signals)
 
     def failing() -> tuple[str, ...]:
         healths = {name: device.health() for name, device in used.items()}
@@ -189,7 +202,12 @@ def start_controller(
 
 
 def controller_of(
-    cell: Cell, devices: Mapping[str, Any], *, clock: Clock, is_latched: Callable[[], bool]
+    cell: Cell,
+    devices: Mapping[str, Any],
+    *,
+    clock: Clock,
+    is_latched: Callable[[], bool],
+    signals: CellSignals | None = None,
 ) -> Controller:
     """Start a control thread for the first arm, gripper, force/torque and touch sensor and for all proximity sensors.
 
@@ -221,6 +239,7 @@ def controller_of(
         load=_load(cell, wrist),
         flange_from_sensor=flange_from(cell, wrist),
         is_latched=is_latched,
+        signals=signals,
         flange_from_grip=flange_from(cell, gripper),
         rate_hz=cell.file.cell.control_rate_hz,
     )

@@ -17,12 +17,12 @@ import signal
 import socket
 import sys
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 from hal.priorities import Priority, take_priority
 from hal.process_state import MOVES, set_memory_priority
 from service.processes.beat import PERIOD_S, SILENCE_S, Beat
-from service.processes.latch import LATCH, Latch, LatchState
+from service.processes.latch import LATCH, Latch, LatchState, StopLevel
 
 MAX_HEAD_BYTES = 65_536  # browsers send the cookies of all pages of this machine, whatever their port
 HEAD_TIMEOUT_S = 2.0
@@ -79,7 +79,7 @@ class StopServer:
     def begin(self, line: bytes, peer: str) -> LatchState | None:
         """Latch the stop if the request line asks for it; nothing that follows can prevent it."""
         method, path = _asked(line)
-        return self._latch.set(f"POST {PATH} from {peer}") if (method, path) == ("POST", PATH) else None
+        return self._latch.set(f"POST {PATH} from {peer}", _level(line)) if (method, path) == ("POST", PATH) else None
 
     async def _is_recorded(self, state: LatchState | None) -> bool:
         """Wait a moment until the service has recorded the stop; returns whether it has."""
@@ -151,6 +151,17 @@ def _asked(head: bytes) -> tuple[str, str]:
     return method, rest.partition(" ")[0].partition("?")[0].rstrip("/")
 
 
+def _level(line: bytes) -> StopLevel:
+    """Return the level of a stop; whatever does not ask to hold switches off."""
+    target = line.decode("latin-1").strip().partition(" ")[2].partition(" ")[0]
+    return level_of(parse_qs(target.partition("?")[2]).get("level", [""])[-1])
+
+
+def level_of(text: str) -> StopLevel:
+    """Return the level that a caller names; a stop is never refused, so that an unknown name switches off."""
+    return StopLevel.HOLD if text == StopLevel.HOLD else StopLevel.OFF
+
+
 def _hostname(host: str) -> str:
     name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
     return name.strip("[]").lower()
@@ -163,14 +174,15 @@ def as_dict(state: LatchState) -> dict[str, object]:
         "count": state.count,
         "changed_time_s": state.time_s,
         "source": state.source,
+        "level": str(state.level),
     }
 
 
 def obey(latch: Latch, line: str) -> None:
-    """Carry out one line from the supervisor: `stop SOURCE` or `reset COUNT SOURCE`."""
+    """Carry out one line from the supervisor: `stop SOURCE`, `hold SOURCE` or `reset COUNT SOURCE`."""
     command, _, rest = line.strip().partition(" ")
-    if command == "stop":
-        latch.set(rest)
+    if command in ("stop", "hold"):
+        latch.set(rest, level_of(command))
     if command == "reset":
         count, _, source = rest.partition(" ")
         latch.reset(source, seen_count=int(count))
@@ -193,7 +205,7 @@ class Watchdog:
     def look(self) -> None:
         """Give one heartbeat and look at those of the others once."""
         self._own.beat()
-        if self._latch.is_set():
+        if self._latch.is_set() and not self._latch.keeps_power():
             return
         for name, beat in self._others.items():
             if (why := beat.lost(silence_s=self._silence_s)) is not None:

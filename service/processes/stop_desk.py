@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from hal.errors import CellError, MotionRefused
 from hal.isolated import Report
-from service.processes.latch import Latch, LatchState
+from service.processes.latch import Latch, LatchState, StopLevel
 
 SEEN_S = 1.0  # nobody has seen a stop that is younger
 log = logging.getLogger(__name__)
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 class StopHost(Protocol):
     """The interface of the object that writes the latch."""
 
-    def stop(self, source: str) -> LatchState:
+    def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the stop; never fails."""
         ...
 
@@ -89,10 +89,10 @@ class StopDesk:
         self._noted_s = time.monotonic()
         self._noting = threading.Lock()
 
-    def stop(self, source: str) -> LatchState:
+    def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the software stop; returns when it is also recorded, if that is possible."""
         with self._noting:  # so that this call records the stop, and not `note_stop`, which does not wait for the disk
-            state = self._host.stop(source)
+            state = self._host.stop(source, level)
             self._noted, self._noted_s = state.count, time.monotonic()
         try:
             self._record(state)
@@ -119,7 +119,7 @@ class StopDesk:
             log.error("the stop is latched but not recorded: %s", error.for_people())
 
     def _record(self, state: LatchState) -> None:
-        self._records.commit("stop", {"source": state.source, "count": state.count})
+        self._records.commit("stop", {"source": state.source, "count": state.count, "level": str(state.level)})
         with contextlib.suppress(ValueError):  # the latch is closed
             self._latch.note_recorded(state.count)
 

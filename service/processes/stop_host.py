@@ -15,7 +15,7 @@ from typing import Any
 from hal.errors import ConfigError, MotionRefused
 from service.processes.beat import SILENCE_S, Beat
 from service.processes.child import Child
-from service.processes.latch import Latch, LatchState
+from service.processes.latch import Latch, LatchState, StopLevel
 from service.processes.stop import StopServer
 
 STOP_ANSWER_S = 0.5  # after this, the latch is set from this process
@@ -40,9 +40,9 @@ class InlineStop:
             start = StopServer(latch, origins).start(listener)
             self._server = asyncio.run_coroutine_threadsafe(start, self._loop).result(READY_S)
 
-    def stop(self, source: str) -> LatchState:
+    def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the stop."""
-        return self._latch.set(source)
+        return self._latch.set(source, level)
 
     def reset(self, source: str, *, seen_count: int) -> bool:
         """Clear the latch unless it was set again after `seen_count`."""
@@ -137,12 +137,13 @@ class ProcessStop:
         if now_s - self._lost_since_s > LOST_S:
             self._child.kill()  # `_exited` starts it again
 
-    def stop(self, source: str) -> LatchState:
+    def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the stop through the stop process, or directly when that does not answer."""
         count = self._latch.state().count
-        is_told = self._child.is_alive() and self._child.write_line(f"stop {_line(source)}")
+        command = "hold" if level is StopLevel.HOLD else "stop"
+        is_told = self._child.is_alive() and self._child.write_line(f"{command} {_line(source)}")
         if not (is_told and self._has_changed(count, STOP_ANSWER_S)):
-            self._latch.set(source)
+            self._latch.set(source, level)
         return self._latch.state()
 
     def reset(self, source: str, *, seen_count: int) -> bool:

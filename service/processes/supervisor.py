@@ -16,13 +16,14 @@ from typing import Any
 from hal import pauses
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
+from hal.motion import CellSignals
 from service.processes.beat import SILENCE_S, Beat, every_beat
 from service.processes.cell import CellRuntime
 from service.processes.cell_lines import LOST, MISSING, CellOrder, error_from_line, note_from_line
 from service.processes.child import Child
 from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
 from service.processes.early_cell import EarlyCell, begin_cell
-from service.processes.latch import LATCH, Latch, LatchState
+from service.processes.latch import LATCH, Latch, LatchState, StopLevel
 from service.processes.runtime_folder import RuntimeFolder
 from service.processes.stop_desk import Records, StopDesk, StopHost
 from service.processes.stop_host import InlineStop, ProcessStop
@@ -174,9 +175,9 @@ class Supervisor:
             self._is_watched = True
             threading.Thread(target=self._watch, name="watch-cell", daemon=True).start()
 
-    def stop(self, source: str) -> LatchState:
+    def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the software stop; see `StopDesk.stop`."""
-        return self._desk.stop(source)
+        return self._desk.stop(source, level)
 
     def note_stop(self) -> None:
         """Record a stop that was made at the stop port; call it periodically."""
@@ -242,6 +243,7 @@ class Supervisor:
         return CellRuntime.start(
             self.cell,
             is_latched=self.latch.is_set,
+            signals=CellSignals(is_reduced=self.latch.is_reduced, keeps_power=self.latch.keeps_power),
             runs_dir=self._runs_dir,
             partial=self._partial,
             report=self._note,

@@ -159,11 +159,19 @@ Step = Annotated[
 ]
 
 
+class MissionLimits(Strict):
+    """`[limits]` of a mission file: limits of its motions besides those of the cell, of which the stricter holds."""
+
+    speed_m_per_s: Annotated[float | None, Field(ge=0.02, le=2.0, description="largest speed of the tool's tip")] = None
+    force_n: Annotated[float | None, Field(gt=0.0, le=500.0, description="contact force that ends any motion")] = None
+
+
 class MissionFile(Strict):
     """A mission: its steps run one after the other, after the panel has been located and its objects found."""
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
     title: Annotated[str, Field(max_length=200)] = ""
+    limits: MissionLimits = MissionLimits()
     steps: Annotated[tuple[Step, ...], Field(min_length=1, max_length=MOST_STEPS)]
 
     @model_validator(mode="after")

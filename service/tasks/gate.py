@@ -14,8 +14,10 @@ from hal.clock import Clock
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import DeviceError
-from hal.motion import DeclaredMotion, MotionReport, Mover, RobotState
+from hal.motion import DeclaredMotion, MotionLimits, MotionReport, Mover, RobotState
 from service.processes.connection import CellConnection
+
+After = Callable[[MotionReport, Mover, MotionLimits], object]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,14 +28,14 @@ class GatedMover:
         check: raises when the task may not move any more.
         arms: names of devices whose failure stops the cell.
         stop: latches the stop; takes the reason.
-        after: called with the report of each motion and the mover behind the gate; see `Losses`.
+        after: called with the report of each motion, the mover behind the gate and the motion's limits; see `Losses`.
     """
 
     mover: Mover
     check: Callable[[], None]
     arms: Collection[str] = ()
     stop: Callable[[str], object] = lambda _reason: None
-    after: Callable[[MotionReport, Mover], object] = lambda _report, _mover: None
+    after: After = lambda _report, _mover, _limits: None
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
         """Run the motion.
@@ -45,7 +47,7 @@ class GatedMover:
         report = self.mover.execute(motion)
         if report.device in self.arms:
             self.stop(report.cause)
-        self.after(report, self.mover)
+        self.after(report, self.mover, motion.limits)
         return report
 
     def cancel(self) -> None:
@@ -77,7 +79,7 @@ class GatedConnection:
         *,
         cell: Cell | None = None,
         stop: Callable[[str], object] = lambda _reason: None,
-        after: Callable[[MotionReport, Mover], object] = lambda _report, _mover: None,
+        after: After = lambda _report, _mover, _limits: None,
     ) -> None:
         self._connection = connection
         self._check = check

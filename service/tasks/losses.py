@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from hal.arrays import Array
 from hal.config import Cell, LossAction
 from hal.devices import DeviceKind
 from hal.errors import CellError
-from hal.motion import JointTrajectory, MotionOutcome, MotionReport, Mover
+from hal.motion import JointTrajectory, MotionLimits, MotionOutcome, MotionReport, Mover
 
 BACK_M = 0.10  # of the tip; further away nothing is touched any more
 BACK_M_PER_S = 0.05
@@ -53,18 +54,18 @@ class Losses:
         if self._safety.client_lost == "stop":
             self._stop(why)
 
-    def followed(self, task: str, check: Callable[[], None]) -> Callable[[MotionReport, Mover], None]:
-        """Return what must be called with the report of each motion of a task, and with the mover.
+    def followed(self, task: str, check: Callable[[], None]) -> Callable[[MotionReport, Mover, MotionLimits], None]:
+        """Return what must be called with the report of each motion of a task, the mover and the motion's limits.
 
         Args:
             check: raises when the stop was pressed after the task was asked for, even if it was reset since.
         """
         trail = Trail()
 
-        def after(report: MotionReport, mover: Mover) -> None:
+        def after(report: MotionReport, mover: Mover, limits: MotionLimits) -> None:
             trail.add(report)
             if self._action(task, report) == "retreat" and (motion := trail.way_back()) is not None:
-                self._go_back(motion, mover, check)
+                self._go_back(replace(motion, limits=limits), mover, check)
 
         return after
 

@@ -25,6 +25,7 @@ from hal.devices import (
 )
 from hal.errors import DeviceTimeout, DeviceUnavailable
 from hal.geometry import transform_rpy
+from hal.motion import CellSignals
 from hal.readings import Cause, Quality, Stamped
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control.controller import Controller
@@ -221,13 +222,15 @@ class Rig:
     world: World
     controller: Controller
     latched: list[bool]
+    near: list[bool] = field(default_factory=lambda: [False])  # whether people are
+    held: list[bool] = field(default_factory=lambda: [False])  # whether a stop leaves the drives on
 
 
 def make_rig(
     *, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25, safety: SafetySection | None = None
 ) -> Rig:
     """Return a started controller; the caller must close `rig.controller`."""
-    world, latched = World(), [False]
+    world, latched, near, held = World(), [False], [False], [False]
     controller = Controller(
         MotionDevices(
             arm=FakeArm("arm", world),
@@ -241,11 +244,12 @@ def make_rig(
         load=LOAD,
         flange_from_sensor=SENSOR,
         is_latched=lambda: latched[0],
+        signals=CellSignals(is_reduced=lambda: near[0], keeps_power=lambda: held[0]),
         flange_from_grip=GRIP,
         rate_hz=500.0,
     )
     controller.start()
-    return Rig(world, controller, latched)
+    return Rig(world, controller, latched, near, held)
 
 
 def tool_pose(q: np.ndarray) -> RigidTransform:

@@ -136,6 +136,7 @@ def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
     free = {call for call, row in TABLE.items() if row.asks is Asks.NOTHING and not call.startswith(("GET ", "WS "))}
     assert free == {
         "POST /v1/stop",  # ending is always allowed
+        "POST /v1/speed/reduce",  # so is making the arm slow
         "POST /v1/tasks/{task_id}/cancel",
         "POST /v1/session",  # about the caller alone
         "DELETE /v1/session",

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from hal.errors import CellError, DeviceFault, InvalidRequest, NotFound, Unreachable
+from hal.motion import MotionLimits
 from hal.strict import validate
 from service.errors import StepFailed
 from service.missions import interpreter
@@ -343,3 +344,16 @@ def test_the_random_missions_find_planted_defects(monkeypatch: pytest.MonkeyPatc
 def test_every_condition_of_a_step_is_found() -> None:
     both = {"kind": "require", "name": "r", "needs": [LOW], "conditions": [IS_ON]}
     assert [one.object for one in conditions_of(mission(both).steps[0])] == ["pressure", "pump"]
+
+
+def test_the_strictest_limits_of_a_mission_and_of_those_that_it_calls_hold() -> None:
+    def limited(**limits: float) -> MissionFile:
+        return validate({"steps": [OPEN], "limits": limits}, MissionFile, source="mission")
+
+    alone = Progress(mission=mission(OPEN), library={})
+    assert alone.limits() == MotionLimits()
+    called = {"inner": limited(speed_m_per_s=0.05, force_n=60.0)}
+    both = Progress(mission=limited(speed_m_per_s=0.1, force_n=20.0), library=called)
+    assert both.limits() == MotionLimits(speed_m_per_s=0.05, force_n=20.0)
+    with pytest.raises(CellError, match=r"limits\.force_n"):
+        limited(force_n=-1.0)

@@ -16,7 +16,7 @@ import hal.jit  # noqa: F401 - the compiler of this project declares its pauses
 from hal import pauses
 from hal.process_state import ProcessState, process_state
 from service.processes.beat import ASLEEP_S, LOOK_S, STILL_S, Beat
-from service.processes.latch import Latch
+from service.processes.latch import Latch, StopLevel
 from service.processes.stop import Watchdog
 from tests.service.waiting import eventually
 
@@ -145,6 +145,22 @@ def test_the_stop_process_latches_for_each_process_that_is_lost(tmp_path: Path, 
     count = latch.state().count
     watchdog.look()
     assert latch.state().count == count, "one loss is one stop"
+
+
+def test_the_loss_of_a_process_makes_a_stop_that_holds_one_that_switches_off(tmp_path: Path) -> None:
+    latch, beat = Latch.create(tmp_path / "latch"), Beat(tmp_path, "service")
+    watchdog = Watchdog(latch, tmp_path, silence_s=0.0)
+    latch.reset("test", seen_count=latch.state().count)
+    latch.set("a person", StopLevel.HOLD)
+    assert latch.keeps_power()
+    beat.beat()
+
+    def is_off() -> bool:
+        watchdog.look()
+        return not latch.keeps_power()
+
+    eventually(is_off)
+    assert latch.is_set()
 
 
 def test_the_state_of_a_process_is_that_of_the_operating_system() -> None:

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from service.processes.latch import BODY_AT, CLEAR, SIZE, Latch
+from service.processes.latch import BODY_AT, CLEAR, FULL_SPEED, HELD, SIZE, SPEED_AT, Latch, StopLevel
 from service.processes.stop import StopServer, obey
 
 
@@ -186,6 +186,24 @@ def test_the_supervisors_lines_stop_and_reset(tmp_path: Path) -> None:
     assert latch.state().source == "a good reason"
     obey(latch, "reset 0 too late\n")
     assert latch.is_set()
+
+
+def test_a_damaged_or_closed_latch_switches_off_and_makes_the_arm_slow(tmp_path: Path) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    obey(latch, f"reset {latch.state().count} the supervisor\n")
+    assert not latch.is_reduced()
+    obey(latch, "hold a good reason\n")
+    assert (latch.is_set(), latch.keeps_power(), latch.state().level) == (True, True, StopLevel.HOLD)
+    for byte in {*range(256)} - {HELD, CLEAR}:
+        latch._memory[BODY_AT] = byte
+        assert latch.is_set() and not latch.keeps_power()
+        latch.set("a person", StopLevel.HOLD)
+        assert not latch.keeps_power(), "a stop that switches off is never made weaker"
+    for byte in {*range(256)} - {FULL_SPEED}:
+        latch._memory[SPEED_AT] = byte
+        assert latch.is_reduced()
+    latch.close()
+    assert latch.is_set() and not latch.keeps_power() and latch.is_reduced()
 
 
 def test_slow_and_broken_clients_hold_nobody_up(tmp_path: Path) -> None:

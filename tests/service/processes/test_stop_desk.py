@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hal.errors import MotionRefused
-from service.processes.latch import Latch, LatchState
+from service.processes.latch import Latch, LatchState, StopLevel
 from service.processes.stop_desk import Records, StopDesk
 
 
@@ -21,8 +21,8 @@ class Host:
         self.latch = latch
         self.alive = True
 
-    def stop(self, source: str) -> LatchState:
-        return self.latch.set(source)
+    def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
+        return self.latch.set(source, level)
 
     def reset(self, source: str, *, seen_count: int) -> bool:
         return self.latch.reset(source, seen_count=seen_count)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,11 @@ import pytest
 
 from hal.config import Cell, load_cell
 from hal.errors import Stopped
-from hal.motion import Hold, MotionOutcome, MotionReport
+from hal.motion import Hold, MotionLimits, MotionOutcome, MotionReport
 from service.tasks.gate import GatedMover
 from service.tasks.losses import BACK_M, Losses
 from tests.manipulation.control.test_controller import forwards
-from tests.manipulation.rig import Rig, make_rig
+from tests.manipulation.rig import Rig, make_rig, tool_pose
 from tests.service.conftest import WriteCell
 
 WAY_M = 0.05
@@ -106,6 +107,15 @@ def test_a_motion_that_is_cancelled_or_meets_a_force_does_not_go_back(rig: Rig, 
     scene.at_way(rig.controller.cancel)
     assert scene.gate.execute(forwards(0.1)).outcome is MotionOutcome.CANCELLED
     assert scene.gone_m() >= WAY_M and scene.checked == []
+
+
+def test_the_way_back_keeps_the_limits_of_the_motion_that_was_lost(rig: Rig, write_cell: WriteCell) -> None:
+    scene = Scene(rig, cell_of(write_cell, client_lost="retreat"))
+    scene.at_way(scene.lose_client)
+    scene.gate.execute(replace(forwards(0.1), limits=MotionLimits(speed_m_per_s=0.02)))
+    assert scene.gone_m() < 0.005
+    tips = np.array([tool_pose(q).translation for q in rig.world.commands])
+    assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / 0.002 <= 0.02 * 1.002
 
 
 def test_a_stop_that_was_pressed_and_reset_meanwhile_keeps_the_arm_where_it_is(rig: Rig, write_cell: WriteCell) -> None:

@@ -58,6 +58,14 @@ class ControlThread:
         if self._thread is not None:
             self._thread.join(timeout=JOIN_S)
 
+    @property
+    def ticking(self) -> int | None:
+        """Id of the thread while it must have a turn in each period; None while it may sleep or does not run."""
+        thread = self._thread
+        if self._beat is None or self._is_closing or thread is None or not thread.is_alive():
+            return None
+        return thread.native_id
+
     def do(self, call: Callable[[], T]) -> T:
         """Run `call` on the thread and return its result; what it raises is raised here.
 

@@ -143,7 +143,9 @@ class Controller:
         self._cancel.set()
         self._thread.close()
 
-    # -- the Mover port --------------------------------------------------------------------------------------------
+    def ticking(self) -> int | None:
+        """Return the id of the control thread while it must have a turn in each tick; see `ControlThread.ticking`."""
+        return self._thread.ticking
 
     def execute(self, motion: DeclaredMotion) -> MotionReport:
         """Execute the motion on the control thread and wait for its end.
@@ -198,8 +200,6 @@ class Controller:
     def not_stopped(self) -> tuple[str, ...]:
         """Return which devices did not do what the last stop or early end asked of them, and why; asks no device."""
         return self._not_stopped
-
-    # -- between motions -------------------------------------------------------------------------------------------
 
     def _hold(self) -> None:
         """Run one tick between motions on a wall clock: hold the arm, serve its watchdog and refresh the state."""

@@ -32,6 +32,7 @@ from service.knowledge.calibrations import Calibrations
 from service.processes.cell_lines import MISSING, CellOrder, error_to_line, note_to_line
 from service.processes.child import Lifeline, kill_own_group
 from service.processes.connection import BEHIND, CLOCK, MOVER, PREFIX, SWAPPER
+from service.processes.control_watch import ControlWatch
 from service.processes.device_slots import (
     Connect,
     DeviceSlot,
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 
 CLOSE_TIMEOUT_S = 4.0
 SWITCH_S = 0.0005  # interpreter switch interval: the longest that the control thread waits for another thread
+NO_WATCH = ControlWatch(lambda: None)
 log = logging.getLogger(__name__)
 
 
@@ -58,13 +60,14 @@ log = logging.getLogger(__name__)
 class CellRuntime:
     """A running cell; `objects` maps names to the objects that are served: devices, the mover and the clock.
 
-    `why_ended` returns why the cell must be started again, for example because its world has ended; None while it can go on.
+    `world_ended` returns how its world was lost, None while it lives; `watch` notices that its control thread is blocked.
     """
 
     cell: Cell
     clock: Clock
     objects: Mapping[str, Any]
-    why_ended: Callable[[], str | None] = lambda: None
+    world_ended: Callable[[], str | None] = lambda: None
+    watch: ControlWatch = NO_WATCH
     _closers: list[Callable[[], None]] = field(default_factory=list)
 
     @classmethod
@@ -88,7 +91,7 @@ class CellRuntime:
             runs_dir: folder of the records of `panelwright calibrate`, which motion uses; devices use those of the cell file.
             partial: whether to continue without devices that do not connect; an invalid cell file is refused in any case.
             report: called when an isolated driver stops or restarts, and for each device that is `MISSING`.
-            record: the recorder to which every call of the devices, the mover and the clock is told.
+            record: the recorder to which every call is told.
 
         Raises:
             CellError: lists everything that could not be connected; what had been started is closed again.
@@ -97,7 +100,7 @@ class CellRuntime:
         cell.file.devices.update(swapped or {})
         _import_drivers(cell)
         clock, shared = clock_for(cell), Shared()
-        closers: list[Callable[[], None]] = [shared.close]
+        closers = [shared.close]
         try:
             far_sides = start_emulators(cell, clock, shared, closers)
 
@@ -112,10 +115,9 @@ class CellRuntime:
                 make = functools.partial(isolated_device, report=report) if section.isolate else connect_device
                 return checked(name, make(context, section.driver, section.options), section)
 
-            sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
-            slots = _connect_all(cell, sections, connect, closers, report=report if partial else None)
-            behind = {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
-            objects: dict[str, Any] = {**slots, **behind, PREFIX + CLOCK: clock}
+            slots = _connect_all(cell, complete, connect, closers, report=report if partial else None)
+            objects: dict[str, Any] = {**slots, PREFIX + CLOCK: clock}
+            objects |= {PREFIX + BEHIND + name: far_side.backing for name, far_side in far_sides.items()}
             tap = _tap(record, clock, report, closers)
             used = tap.for_control(slots) if tap else slots
             motion = _motion(cell, used, clock=clock, runs_dir=runs_dir, is_latched=is_latched, signals=signals)
@@ -127,7 +129,12 @@ class CellRuntime:
         except BaseException:
             _close_all(closers)
             raise
-        return cls(cell=cell, clock=clock, objects=objects, why_ended=shared.why_ended, _closers=closers)
+        watch = NO_WATCH if motion is None else motion.watch
+        return cls(cell=cell, clock=clock, objects=objects, world_ended=shared.why_ended, watch=watch, _closers=closers)
+
+    def why_ended(self) -> str | None:
+        """Return why the cell must be started again: its world has ended, or its control thread will not come back."""
+        return self.world_ended() or self.watch.why_ended()
 
     def close(self) -> None:
         """Stop the arm, then close devices, emulators and world even if some of them fail. Idempotent."""
@@ -208,7 +215,7 @@ def start_emulators(cell: Cell, clock: Clock, shared: Shared, closers: list[Call
 
 def _connect_all(
     cell: Cell,
-    sections: Mapping[str, DeviceSection],
+    complete: Callable[[str, DeviceSection], DeviceSection],
     connect: Connect,
     closers: list[Callable[[], None]],
     *,
@@ -218,6 +225,7 @@ def _connect_all(
 
     With a `report`, the slot of a device that did not connect gets an `UnavailableDevice`; without one, it is an error.
     """
+    sections = {name: complete(name, section) for name, section in cell.file.devices.items()}
     with ThreadPoolExecutor(len(sections), thread_name_prefix="connect") as pool:
         waiting = {name: pool.submit(connect, name, section) for name, section in sections.items()}
     failed: dict[str, CellError] = {}
@@ -286,7 +294,7 @@ def main() -> None:
         _in_background(lambda: _end_with_parent(lifeline, is_orphan))
 
         def is_lost() -> bool:
-            return is_orphan.is_set() or vigil.is_alone
+            return is_orphan.is_set() or vigil.is_alone or vigil.is_blocked
 
         signals = CellSignals(is_reduced=latch.is_reduced, keeps_power=lambda: latch.keeps_power() and not is_lost())
         try:
@@ -322,7 +330,7 @@ def _run(
     drop_spare()
     server = serve(runtime.objects, order.address, bytes.fromhex(order.authkey), clock=runtime.clock)
     freeze_loaded()
-    vigil.watch(runtime.why_ended)
+    vigil.watch(runtime.why_ended, runtime.watch.why_blocked)
     lifeline.write_line("ready")
     end.wait()
     vigil.watch(lambda: None)  # from now on the world may end

@@ -13,6 +13,7 @@ from service.processes.beat import SILENCE_S
 
 NOTE = "note "  # prefix of a line that goes into the journal
 MISSING = "device-missing"  # kind of the note that says that the cell runs without this device
+BLOCKED = "control-blocked"  # kind of the note that the control thread does not come back; `why` says how long
 LOST = "cell-lost"  # kind of the note with which a cell ends that lost something it cannot run without
 
 

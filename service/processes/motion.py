@@ -11,13 +11,14 @@ from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
 from hal.calibration import ToolLoad
-from hal.clock import Clock, Deadline, SimClock
+from hal.clock import Clock, Deadline, SimClock, WallClock
 from hal.config import Cell
 from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, MotionRefused
 from hal.geometry import identity
 from hal.motion import CellSignals, DeclaredMotion, MotionReport, RobotState
 from hal.readings import Quality
+from service.processes.control_watch import Commanded, ControlWatch
 from service.processes.device_slots import IN_MOTION, DeviceSlot, UnavailableDevice
 
 if TYPE_CHECKING:
@@ -48,6 +49,10 @@ class Standstill:
     def cancel(self) -> None:
         """Do nothing, because no motion runs."""
 
+    def ticking(self) -> int | None:
+        """Return None, because there is no control thread."""
+        return None
+
     def not_stopped(self) -> tuple[str, ...]:
         """Return nothing, because nothing moves."""
         return ()
@@ -60,7 +65,7 @@ class MotionPort:
     """The mover for several clients; reading the state never interrupts or refuses a motion.
 
     Args:
-        start: starts the control thread, or raises why it cannot be started yet.
+        start: starts the control thread, whose commands it tells to the watch, or raises why it cannot be started yet.
         failing: returns which of its devices do not answer, and why.
 
     In the controller, reading the state from the devices and a motion exclude each other. Here a motion waits for such a
@@ -69,18 +74,20 @@ class MotionPort:
 
     def __init__(
         self,
-        start: Callable[[], Controller | Standstill],
+        start: Callable[[ControlWatch], Controller | Standstill],
         *,
         clock: Clock,
         is_latched: Callable[[], bool],
         failing: Callable[[], tuple[str, ...]],
     ) -> None:
         self._start = start
-        self._controller = start()
         self._clock = clock
         self._failing = failing
         self._is_latched = is_latched
         self._newest: RobotState | None = None
+        self._is_restarting = True
+        self.watch = ControlWatch(self._ticking)
+        self._controller = start(self.watch)
         self._is_restarting = False
         self._is_executing = threading.Lock()
         self._devices_in_use = threading.Lock()
@@ -122,6 +129,12 @@ class MotionPort:
             if is_free:
                 self._devices_in_use.release()
 
+    def _ticking(self) -> int | None:
+        is_real = isinstance(
+            self._clock, WallClock
+        )  # otherwise the thread waits for the world, which is watched itself
+        return self._controller.ticking() if is_real and not self._is_restarting else None
+
     def at_rest(self, work: Callable[[], None]) -> None:
         """Run `work` while no motion runs and none can begin; without a control thread, try to start one afterwards.
 
@@ -147,7 +160,7 @@ class MotionPort:
                 between()
             finally:
                 try:
-                    self._controller, self._newest = self._start(), None
+                    self._controller, self._newest = self._start(self.watch), None
                 finally:
                     self._is_restarting = False
 
@@ -184,11 +197,11 @@ def start_controller(
     """Start the control thread for the cell's devices and return its port; errors as for `controller_of`."""
     used = {name: devices[name] for name, section in cell.file.devices.items() if section.kind in IN_MOTION}
 
-    def start() -> Controller | Standstill:
+    def start(watch: ControlWatch) -> Controller | Standstill:
         for slot in used.values():
             if isinstance(absent := slot.installed(), UnavailableDevice):
                 return Standstill(absent.why)
-        return controller_of(cell, devices, clock=clock, is_latched=is_latched, signals=signals)
+        return controller_of(cell, devices, clock=clock, is_latched=is_latched, signals=signals, watch=watch)
 
     def failing() -> tuple[str, ...]:
         healths = {name: device.health() for name, device in used.items()}
@@ -208,6 +221,7 @@ def controller_of(
     clock: Clock,
     is_latched: Callable[[], bool],
     signals: CellSignals | None = None,
+    watch: ControlWatch | None = None,
 ) -> Controller:
     """Start a control thread for the first arm, gripper, force/torque and touch sensor and for all proximity sensors.
 
@@ -224,6 +238,8 @@ def controller_of(
             file=str(cell.path),
             key="devices",
         )
+    if watch is not None:
+        arm, gripper = Commanded(arm, watch, "enable", "stop"), Commanded(gripper, watch, "command")
     wrist = _first(cell, devices, DeviceKind.FORCE_TORQUE)
     _check_joints(cell, arm)
     controller = Controller(

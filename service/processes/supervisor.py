@@ -19,7 +19,7 @@ from hal.errors import CellError, DeviceTimeout, DeviceUnavailable
 from hal.motion import CellSignals
 from service.processes.beat import SILENCE_S, Beat, every_beat
 from service.processes.cell import CellRuntime
-from service.processes.cell_lines import LOST, MISSING, CellOrder, error_from_line, note_from_line
+from service.processes.cell_lines import BLOCKED, LOST, MISSING, CellOrder, error_from_line, note_from_line
 from service.processes.child import Child
 from service.processes.connection import CellConnection, LocalConnection, RemoteConnection
 from service.processes.early_cell import EarlyCell, begin_cell
@@ -198,14 +198,9 @@ class Supervisor:
         child = self._child
         alive = self._local is not None or (child is not None and child.is_alive())
         detail = self._problem.what if self._problem is not None else ""
+        pid = None if child is None else child.pid
         return (
-            ProcessHealth(
-                name="cell",
-                pid=child.pid if child is not None else None,
-                is_alive=alive,
-                restarts=self._restarts,
-                detail=detail,
-            ),
+            ProcessHealth(name="cell", pid=pid, is_alive=alive, restarts=self._restarts, detail=detail),
             ProcessHealth(
                 name="stop", pid=self._stop.pid, is_alive=self._stop.is_alive(), restarts=self._stop.restarts
             ),
@@ -300,6 +295,8 @@ class Supervisor:
             self._missing[data["device"]] = MissingDevice(**data)
         if kind == LOST:
             self._why_lost = data["why"]
+        if kind == BLOCKED:
+            self.stop(data["why"])
         self._report(kind, data)
 
     def _order(self) -> CellOrder:

@@ -18,8 +18,17 @@ def test_what_shows_a_promise_exists() -> None:
     assert missing == []
 
 
+def test_every_test_that_the_page_names_exists() -> None:
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", PAGE)
+    assert len(named) > 20
+    missing = [
+        f"{path}::{name}" for path, name in named if f"def {name}(" not in (ROOT / path).read_text(encoding="utf-8")
+    ]
+    assert missing == []
+
+
 def test_every_promise_of_the_table_names_a_test() -> None:
     _, _, table = PAGE.partition("| promise | tests | figures |")
-    rows = [line for line in table.splitlines()[2:] if line.startswith("|")]
+    rows = [line for line in table.partition("\n## ")[0].splitlines()[2:] if line.startswith("|")]
     assert len(rows) > 10
     assert [row for row in rows if "tests/" not in row.split("|")[2]] == []

@@ -76,13 +76,21 @@ def read_text(path: Path, what: str) -> str:
 
 def parse_toml(text: str, model: type[M], *, source: str) -> M:
     """Validate TOML text as `model`; `source` names it in errors."""
+    return validate(toml_data(text, source=source), model, source=source)
+
+
+def toml_data(text: str, *, source: str) -> dict[str, Any]:
+    """Return TOML text as plain data; `source` names it in errors.
+
+    Raises:
+        ConfigError: it is not TOML. A number of more digits and arrays within more arrays than Python reads count as that.
+    """
     try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ConfigError(
             f"{source} is not valid TOML: {error}", hint="look at that line; strings need quotes", file=source
         ) from error
-    return validate(data, model, source=source)
 
 
 def validate(data: dict[str, Any], model: type[M], *, source: str) -> M:

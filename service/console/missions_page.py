@@ -44,6 +44,8 @@ def install(place: Place) -> None:
                             button(say("missions.run"), desk.run),
                             button(say("missions.plan"), desk.plan, look="plain"),
                         ]
+                if mirror.may(Role.MAINTAINER):
+                    live(ui.html("", sanitize=False), desk.edit)
                 ui.html(say("missions.says"), sanitize=False, tag="p").classes("quiet")
                 live(ui.html("", sanitize=False).props("role=status"), desk.planned)
             with ui.element("section").classes("card half"):
@@ -155,6 +157,13 @@ class _Desk:
             told = say("missions.unfit", problem=chosen["problem"], hint=chosen["hint"])
             return f'<p class="bad">{attribute(told)}</p>'
         return f"<h3>{say('missions.steps_of')}</h3>" + step_list(chosen["steps"], self._mirror.panel)
+
+    def edit(self) -> str:
+        """Return the ways to the editor, for the chosen mission and for a new one."""
+        chosen, path = self._chosen, "/mission-editor"
+        ways = [] if chosen is None else [(f"{path}?mission={attribute(chosen['name'])}", say("missions.edit"))]
+        links = "".join(f'<a href="{link}">{told}</a> ' for link, told in [*ways, (path, say("missions.new"))])
+        return f'<p class="row">{links}</p>'
 
     def planned(self) -> str:
         """Return the plan of the last dry run as a table."""

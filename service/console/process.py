@@ -21,6 +21,7 @@ from service.console import (
     cell_page,
     devices_page,
     history_page,
+    mission_editor,
     missions_page,
     panel_page,
     review_page,
@@ -41,6 +42,7 @@ WEB = Path(__file__).parent / "web"
 PAGES = (
     panel_page,
     missions_page,
+    mission_editor,
     rounds_page,
     alarms_page,
     review_page,
@@ -86,7 +88,7 @@ def create_app(people: People, *, port: int, stop_port: int, ready: threading.Ev
         reconnect_timeout=5.0,
         language="en-US",
     )
-    app.add_middleware(LogInFirst, people=people, pages=frozenset(PATHS.values()))
+    app.add_middleware(LogInFirst, people=people, pages=frozenset([*PATHS.values(), mission_editor.PATH]))
     app.add_middleware(OwnPageOnly)
     return app
 

@@ -215,6 +215,7 @@ def _document(app: FastAPI, bodies: list[type[BaseModel]]) -> dict[str, Any]:
         TeachRequest,
         *alarms.BODIES,
         *limits.BODIES,
+        *mission_files.BODIES,
         *rounds.BODIES,
         *review.BODIES,
         Problem,

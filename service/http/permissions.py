@@ -66,6 +66,9 @@ TABLE: dict[str, Row] = {
     "GET /v1/frames": OBSERVER,
     "GET /v1/panel": OBSERVER,
     "GET /v1/mission-files": OBSERVER,
+    "GET /v1/mission-files/{mission}": OBSERVER,
+    "POST /v1/mission-files/check": OBSERVER,  # nothing is stored
+    "PUT /v1/mission-files/{mission}": MAINTAINER,
     "GET /v1/missions": OBSERVER,
     "GET /v1/missions/{mission}/{name}": OBSERVER,
     "GET /v1/history": OBSERVER,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+
+from pydantic import TypeAdapter, ValidationError
 
 from hal.entry_points import registered
 from hal.errors import CellError, InvalidRequest
@@ -27,6 +30,7 @@ from service.schema.mission_file import (
 from service.schema.requests import ActionBody
 
 Load = Callable[[str], MissionFile]
+ONE_STEP: TypeAdapter[Step] = TypeAdapter(Step)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +83,18 @@ def _refusal(faults: Sequence[tuple[str, FieldFault]]) -> InvalidRequest:
     )
 
 
+def faults_of_valid_steps(steps: object, panel: Panel) -> list[FieldFault]:
+    """Return what the panel contradicts in plain data of steps, of which some may be malformed; those are passed over."""
+    found: list[FieldFault] = []
+    for k, plain in enumerate(steps if isinstance(steps, list) else ()):
+        try:
+            step = ONE_STEP.validate_json(json.dumps(plain, default=str), strict=True)
+        except ValidationError:
+            continue
+        found += _faults_of_step(step, f"steps.{k}", panel)
+    return found
+
+
 def operable(panel_object: PanelObject, action: ActionBody) -> None:
     """Raise `InvalidRequest` for a control that is forbidden, or that is to be named a second time and is not."""
     name = panel_object.name
@@ -116,23 +132,26 @@ def target_of(panel_object: PanelObject, action: ActionBody) -> str | float:
 
 def _faults_of(steps: Sequence[Step], at: str, panel: Panel) -> Iterator[FieldFault]:
     for k, step in enumerate(steps):
-        key = f"{at}.{k}"
-        yield from _faulty_conditions(step.needs, f"{key}.needs", panel)
-        match step:
-            case InspectStep():
-                for j, name in enumerate(step.objects or ()):
-                    yield from _said(f"{key}.objects.{j}", partial(panel.object, name))
-            case SetStep(object=str(name)):
-                yield from _said(f"{key}.object", partial(_check_set, step, name, panel))
-            case RequireStep() | WaitStep():
-                yield from _faulty_conditions(step.conditions, f"{key}.conditions", panel)
-            case ChooseStep():
-                yield from _faulty_conditions(step.when, f"{key}.when", panel)
-                yield from _faults_of(step.then, f"{key}.then", panel)
-                yield from _faults_of(step.otherwise, f"{key}.otherwise", panel)
-            case RepeatStep():
-                yield from _faulty_conditions(step.until, f"{key}.until", panel)
-                yield from _faults_of(step.steps, f"{key}.steps", panel)
+        yield from _faults_of_step(step, f"{at}.{k}", panel)
+
+
+def _faults_of_step(step: Step, key: str, panel: Panel) -> Iterator[FieldFault]:
+    yield from _faulty_conditions(step.needs, f"{key}.needs", panel)
+    match step:
+        case InspectStep():
+            for j, name in enumerate(step.objects or ()):
+                yield from _said(f"{key}.objects.{j}", partial(panel.object, name))
+        case SetStep(object=str(name)):
+            yield from _said(f"{key}.object", partial(_check_set, step, name, panel))
+        case RequireStep() | WaitStep():
+            yield from _faulty_conditions(step.conditions, f"{key}.conditions", panel)
+        case ChooseStep():
+            yield from _faulty_conditions(step.when, f"{key}.when", panel)
+            yield from _faults_of(step.then, f"{key}.then", panel)
+            yield from _faults_of(step.otherwise, f"{key}.otherwise", panel)
+        case RepeatStep():
+            yield from _faulty_conditions(step.until, f"{key}.until", panel)
+            yield from _faults_of(step.steps, f"{key}.steps", panel)
 
 
 def _check_set(step: SetStep, name: str, panel: Panel) -> None:

@@ -1,19 +1,34 @@
-"""Finds mission files: in `missions/` beside the cell file or above it, then among the shipped ones."""
+"""Finds, reads and stores mission files: in `missions/` beside the cell file or above it; the shipped ones are only read."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
+from hal.atomic_write import write_atomically
 from hal.config import Cell
 from hal.errors import ConfigError
-from hal.strict import load_toml
-from service.missions.check import Checked, check_mission
+from hal.panel import Panel
+from hal.strict import faults_in, read_text, refusal, toml_data, validate
+from service.errors import FileFault, NoSuchMission, NotPossibleNow
+from service.missions.check import Checked, check_mission, faults_of_valid_steps
 from service.schema.mission_file import MissionFile
 from service.schema.mission_request import MissionRequest
 
 SHIPPED = Path(__file__).parents[2] / "missions"
+FILE = "mission file"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionText:
+    """The text of a mission file; `digest` is its SHA-256, `is_shipped` says that it belongs to the package."""
+
+    text: str
+    digest: str
+    is_shipped: bool
 
 
 def mission_paths(cell: Cell) -> dict[str, Path]:
@@ -36,7 +51,81 @@ def load_mission(name: str, cell: Cell) -> MissionFile:
         near = get_close_matches(name, paths, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"missions: {', '.join(sorted(paths)) or 'none'}"
         raise ConfigError(f"there is no mission file {name!r}", hint=hint)
-    return load_toml(paths[name], MissionFile, "mission file")
+    return parse_mission(read_text(paths[name], FILE), cell.panel, source=str(paths[name]))
+
+
+def parse_mission(text: str, panel: Panel, *, source: str) -> MissionFile:
+    """Return a mission from the text of its file; `source` names it in errors.
+
+    Raises:
+        ConfigError: it is malformed; names all faults, among them what the panel contradicts in the steps that are well-formed.
+    """
+    data = toml_data(text, source=source)
+    malformed = faults_in(data, MissionFile)
+    if malformed:
+        raise refusal([*malformed, *faults_of_valid_steps(data.get("steps"), panel)], source=source)
+    return validate(data, MissionFile, source=source)
+
+
+def checked_text(name: str, text: str, cell: Cell) -> Checked:
+    """Check the text of a mission file that is not stored yet, as `checked_file` does with one that is.
+
+    Raises:
+        ConfigError, InvalidRequest: names every fault.
+    """
+    source = f"missions/{name}.toml"
+    mission = parse_mission(text, cell.panel, source=source)
+
+    def load(called: str) -> MissionFile:
+        return mission if called == name else load_mission(called, cell)
+
+    return check_mission(mission, cell.panel, load, source=source)
+
+
+def mission_text(name: str, cell: Cell) -> MissionText:
+    """Return the text of a mission file, also of one that is malformed.
+
+    Raises:
+        NoSuchMission: the cell has no such file.
+        ConfigError: it cannot be read.
+    """
+    path = mission_paths(cell).get(name)
+    if path is None:
+        raise NoSuchMission(f"there is no mission file {name!r}", hint="GET /v1/mission-files lists them")
+    text = read_text(path, FILE)
+    return MissionText(text=text, digest=digest_of(text), is_shipped=path.parent == SHIPPED)
+
+
+def store_mission(name: str, text: str, cell: Cell, *, replaces: str | None, commit: Callable[[Path], None]) -> None:
+    """Check a mission and store it as a file of the cell, in one step: a crash leaves the old or the new file.
+
+    Args:
+        replaces: digest of the text that it takes the place of; None for a new mission. So nobody's changes are lost.
+        commit: records the change durably before it is made.
+
+    Raises:
+        ConfigError, InvalidRequest: it has faults.
+        NotPossibleNow: somebody else has changed or made the file; or the cell's files belong to the package.
+        FileFault: it cannot be written; the old file is still there.
+    """
+    checked_text(name, text, cell)
+    folder = _own_folder(cell)
+    path = folder / f"{name}.toml"
+    now = mission_text(name, cell).digest if name in mission_paths(cell) else None
+    if now != replaces:
+        what = "there is a mission of that name" if replaces is None else "the mission was changed by somebody else"
+        raise NotPossibleNow(f"{name}: {what}", hint="look at the mission as it is now, then save again")
+    commit(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text)
+    except OSError as error:
+        raise FileFault(f"{path} cannot be written: {error}", hint="check permissions and the disk") from error
+
+
+def digest_of(text: str) -> str:
+    """Return the digest by which the text of a mission file is recognised."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def checked_file(name: str, cell: Cell) -> Checked:
@@ -64,6 +153,18 @@ def mission_of(request: MissionRequest, cell: Cell) -> Checked:
     if request.mission is not None:
         return checked(request.mission, cell, source="mission")
     return Checked(mission=request.in_short(), library={})
+
+
+def _own_folder(cell: Cell) -> Path:
+    """Return the folder for mission files of the cell; it is made when the first one is stored."""
+    nearest = next(_folders(cell))
+    if nearest != SHIPPED:
+        return nearest
+    beside = cell.path.resolve().parent
+    if beside == SHIPPED.parent / "cells":
+        hint = "copy the cell with `panelwright init FOLDER`, and serve the copy"
+        raise NotPossibleNow("the missions of this cell belong to the package and are not changed", hint=hint)
+    return beside / "missions"
 
 
 def _folders(cell: Cell) -> Iterator[Path]:

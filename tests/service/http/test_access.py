@@ -143,6 +143,8 @@ def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
         "POST /v1/knowledge/outline",  # writes nothing
         "POST /v1/read-photograph",
         "POST /v1/review/{reading}",  # about the past
+        "POST /v1/mission-files/check",  # writes nothing
+        "PUT /v1/mission-files/{mission}",  # about later: a mission that runs has read its files
         "PUT /v1/rounds/{round}",  # about later: a round waits while somebody holds the lease
         "DELETE /v1/rounds/{round}",
         "PUT /v1/limits/{object}",  # about alarms, for those who watch

@@ -17,11 +17,12 @@ from service.console.service_client import QUICK_S, ServiceClient
 TICK_S = 0.25
 IDLE_S = 15.0  # nobody has looked for so long: do not ask
 LEFT_S = 600.0  # nobody has looked for so long: whoever looked has left
+ROBOT_S = 2.0  # nobody has looked at the robot for so long: its stream is closed
 FEED_S = 10.0  # so long does the service keep a question for new readings and alarms
 PERIODS_S = {
     "ready": 1.0, "tasks": 0.5, "history": 5.0, "alarms": 5.0, "devices": 2.0, "frames": 1.0, "lease": 2.0,
     "stop": 1.0, "missions": 5.0, "mission_files": 10.0, "rounds": 2.0, "review": 2.0,
-    "calibrations": 10.0, "info": 10.0, "panel": 10.0, "arm": 0.25, "arm_model": 30.0,
+    "calibrations": 10.0, "info": 10.0, "panel": 10.0, "arm_model": 30.0, "scanner_model": 30.0,
 }  # fmt: skip
 PATHS = {
     "ready": "/readyz", "tasks": "/v1/tasks?limit=30", "history": "/v1/history", "alarms": "/v1/alarms",
@@ -29,8 +30,9 @@ PATHS = {
     "mission_files": "/v1/mission-files", "rounds": "/v1/rounds", "review": "/v1/review?limit=100",
     "calibrations": "/v1/calibrations", "info": "/v1/info", "panel": "/v1/panel",
 }  # fmt: skip
+MODELS = {"arm_model": ("arm", "arm"), "scanner_model": ("range_scanner", "range_scanner")}
 UNAUTHENTICATED = 401
-ON_DEMAND = ("arm", "arm_model", "mission_files", "rounds", "review")
+ON_DEMAND = ("arm_model", "scanner_model", "mission_files", "rounds", "review")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,12 +70,14 @@ class Mirror:
         self._wanted_s: dict[str, float] = {}
         self._followers: dict[str, asyncio.Task[None]] = {}
         self._panel: tuple[Any, Panel] | None = None
+        self._robot: dict[str, Any] | None = None
+        self._robot_wanted_s = -IDLE_S
         self._loops: list[asyncio.Task[None]] = []
         self._asking: set[asyncio.Task[None]] = set()
 
     def start(self) -> None:
         """Begin to ask, in the running event loop."""
-        self._loops = [asyncio.create_task(self._run()), asyncio.create_task(self._listen())]
+        self._loops = [asyncio.create_task(work()) for work in (self._run, self._listen, self._watch_robot)]
 
     def close(self) -> None:
         """End all requests."""
@@ -104,6 +108,24 @@ class Mirror:
         """Return the newest answer of a topic; a topic that only some pages need is asked for while they do."""
         self._looked_s = self._wanted_s[topic] = time.monotonic()
         return self._said.get(topic, otherwise)
+
+    @property
+    def robot(self) -> dict[str, Any] | None:
+        """What the arm does, as `WS /v1/stream` tells it 20 times a second while somebody looks; None before."""
+        self._looked_s = self._robot_wanted_s = time.monotonic()
+        return self._robot
+
+    @property
+    def planned(self) -> dict[str, Any] | None:
+        """The newest dry run that has a plan, unless something has moved the arm since."""
+        for task in self.tasks:
+            if task["request"].get("dry_run"):
+                result = task["result"]
+                if result is not None and result.get("plan") is not None:
+                    return task
+            elif task["moves"]:
+                return None
+        return None
 
     @property
     def panel(self) -> Panel | None:
@@ -176,6 +198,22 @@ class Mirror:
             if found["alarms"]:
                 await self._ask("alarms")
 
+    async def _watch_robot(self) -> None:
+        """Keep the newest state of the robot while a page shows it; the other pages are not renewed for it."""
+        while True:
+            if self._wants_robot:
+                async with contextlib.aclosing(self.client.robot()) as samples:
+                    async for sample in samples:
+                        self._robot = sample
+                        if not self._wants_robot:
+                            break
+            self._robot = None
+            await asyncio.sleep(TICK_S)
+
+    @property
+    def _wants_robot(self) -> bool:
+        return time.monotonic() - self._robot_wanted_s < ROBOT_S
+
     def _take(self, readings: list[dict[str, Any]]) -> None:
         """Put new readings in the place of older ones of the same objects."""
         before = self._said.get("history")
@@ -214,9 +252,9 @@ class Mirror:
     def _path(self, topic: str) -> str:
         if topic in PATHS:
             return PATHS[topic]
+        kind, usual = MODELS[topic]
         devices = self._said.get("devices", {"devices": []})["devices"]
-        arm = next((one["name"] for one in devices if one["kind"] == "arm"), "arm")
-        return f"/v1/devices/{arm}/reading?max_age_s=0.1" if topic == "arm" else f"/v1/devices/{arm}"
+        return f"/v1/devices/{next((one['name'] for one in devices if one['kind'] == kind), usual)}"
 
     def _follow_active(self) -> None:
         for task in self._said.get("tasks", {"tasks": []})["tasks"][:5]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import tomlkit
@@ -68,8 +69,10 @@ class MissionForm:
             steps = self._steps()
             for number, step in enumerate(steps):
                 if isinstance(step, dict):
-                    with ui.element("div").classes("step").props(
-                        f'role=group aria-label="{say("editor.step", number=number + 1)}"'
+                    with (
+                        ui.element("div")
+                        .classes("step")
+                        .props(f'role=group aria-label="{say("editor.step", number=number + 1)}"')
                     ):
                         self._step(number, step, len(steps))
             button(say("editor.add"), self._add, look="plain")
@@ -84,14 +87,14 @@ class MissionForm:
             ui.html(say("editor.step", number=number + 1), sanitize=False, tag="h3")
             for key, to, is_possible in (("up", number - 1, number > 0), ("down", number + 1, number + 1 < count)):
                 if is_possible:
-                    self._button(f"editor.{key}", number, lambda to=to: self._move(number, to))
+                    self._button(f"editor.move.{key}", number, partial(self._move, number, to))
             if count > 1:
                 self._button("editor.remove", number, lambda: self._remove(number))
         with ui.element("div").classes("fields"):
             _choice("editor.kind", {one: say(f"editor.kind.{one}") for one in KINDS}, kind, self._kind_of(step))
             _field("editor.name", step.get("name", ""), self._putter(step, "name"))
             for key in NUMBERS.get(kind, ()):
-                _number(f"editor.{key}", step.get(key), self._putter(step, key), is_whole=key in WHOLE)
+                _number(f"editor.number.{key}", step.get(key), self._putter(step, key), is_whole=key in WHOLE)
             self._own_fields(kind, step)
             told = {one: say(f"editor.on_failure.{one}") for one in ("stop", "skip", "retry")}
             _choice("editor.on_failure", told, str(step.get("on_failure", "stop")), self._putter(step, "on_failure"))
@@ -112,14 +115,18 @@ class MissionForm:
             field.props("outlined dense options-dense use-chips")
         elif kind == "call":
             names = [one["name"] for one in self._mirror.said("mission_files", {"files": []})["files"]]
-            _choice("editor.call", {one: one for one in names}, str(step.get("mission", "")), self._putter(step, "mission"))
+            _choice(
+                "editor.call", {one: one for one in names}, str(step.get("mission", "")), self._putter(step, "mission")
+            )
         elif kind == "set":
             goals = {} if panel is None else {one.name: label_of(one) for one in panel.objects if one.goal is not None}
             _choice("editor.each", goals, str(step.get("object", "")), self._object_of(step))
             self._target(step, panel)
 
     def _target(self, step: Table, panel: Panel | None) -> None:
-        one = next((one for one in panel.objects if one.name == step.get("object")), None) if panel is not None else None
+        one = (
+            next((one for one in panel.objects if one.name == step.get("object")), None) if panel is not None else None
+        )
         if one is None or one.goal is None or step.get("other"):
             return
         key, goal = one.goal.key, one.goal
@@ -138,7 +145,7 @@ class MissionForm:
         for k, one in enumerate(found if isinstance(found, list) else []):
             if isinstance(one, dict):
                 with ui.element("div").classes("fields"):
-                    self._condition(number, one, lambda k=k: self._drop(step, key, k))
+                    self._condition(number, one, partial(self._drop, step, key, k))
         self._button("editor.add_condition", number, lambda: self._add_condition(step, key))
 
     def _condition(self, number: int, one: Table, drop: Callable[[], None]) -> None:
@@ -242,9 +249,7 @@ def _field(key: str, value: Any, put: Callable[[Any], None]) -> Any:
     return ui.input(label=say(key), value=str(value), on_change=_calls(put)).props("outlined dense debounce=200")
 
 
-def _number(
-    key: str, value: Any, put: Callable[[Any], None], *, is_whole: bool = False, is_text: bool = False
-) -> Any:
+def _number(key: str, value: Any, put: Callable[[Any], None], *, is_whole: bool = False, is_text: bool = False) -> Any:
     label = key if is_text else say(key)
     given = value if isinstance(value, int | float) and not isinstance(value, bool) else None
     number = ui.number(
@@ -255,9 +260,7 @@ def _number(
     return number.props("outlined dense debounce=200")
 
 
-def _choice(
-    key: str, options: dict[str, str], value: str, put: Callable[[Any], None], *, is_text: bool = False
-) -> Any:
+def _choice(key: str, options: dict[str, str], value: str, put: Callable[[Any], None], *, is_text: bool = False) -> Any:
     """Return a field with a list; a value that the list does not have is shown as empty, and stays in the file."""
     label, chosen = key if is_text else say(key), value if value in options else None
     return ui.select(options, value=chosen, label=label, on_change=_calls(put)).props("outlined dense options-dense")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from http.cookiejar import CookieJar, DefaultCookiePolicy
 from typing import Any
 
 import httpx2
+from websockets.asyncio.client import connect
+from websockets.exceptions import WebSocketException
 
 from hal.errors import DeviceUnavailable
 from service.client import ApiError, document
@@ -93,6 +96,16 @@ class ServiceClient:
                     yield document(event.data, self.url)
         except httpx2.RequestError:
             return
+
+    async def robot(self) -> AsyncGenerator[dict[str, Any]]:
+        """Yield the state of the robot, 20 times a second, until the connection is lost; problems are left out."""
+        address = f"{self.url.replace('http', 'ws', 1)}/v1/stream"
+        with contextlib.suppress(WebSocketException, OSError, TimeoutError):
+            async with connect(address, additional_headers=self._headers, proxy=None) as stream:
+                async for text in stream:
+                    sample = document(text, self.url)
+                    if "problem" not in sample:
+                        yield sample
 
     async def close(self) -> None:
         """Close its connections."""

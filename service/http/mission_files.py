@@ -58,7 +58,8 @@ class MissionToStore(Strict):
 
     text: Text
     replaces: Annotated[
-        str | None, Field(pattern="^[0-9a-f]{64}$", description="digest of the text that it replaces; null for a new one")
+        str | None,
+        Field(pattern="^[0-9a-f]{64}$", description="digest of the text that it replaces; null for a new one"),
     ] = None
 
 

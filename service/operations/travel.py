@@ -156,6 +156,7 @@ def _where_the_panel_may_be(session: Session) -> CollisionBox:
     )
 
 
+POINTS_SHOWN = 24  # of each planned way
 CONTACT_S = (
     15.0  # of the cell's clock at one control, from standoff to standoff: the mean of the bench panel's controls
 )
@@ -246,10 +247,13 @@ class _Planner:
         return replace(self._context, mover=_Standing(self._state))
 
     def _note(self, step: str, what: str, way: JointTrajectory | None, problem: str | None) -> None:
-        way_s = None if way is None else float(way.times_s[-1])
+        way_s, flange_m = None, list[list[float]]()
         if way is not None:
+            way_s = float(way.times_s[-1])
             self._state = replace(self._state, position_rad=way.positions_rad[-1])
-        self.stations.append(PlannedStation(step=step, what=what, way_s=way_s, problem=problem))
+            shown = way.positions_rad[np.linspace(0, len(way.positions_rad) - 1, POINTS_SHOWN).round().astype(int)]
+            flange_m = [np.round(self._context.kinematics.flange(q).translation, 4).tolist() for q in shown]
+        self.stations.append(PlannedStation(step=step, what=what, way_s=way_s, problem=problem, flange_m=flange_m))
 
 
 class _Standing:

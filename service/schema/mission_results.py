@@ -94,13 +94,15 @@ class StepResult(Result):
 class PlannedStation(Result):
     """A place to which a planned mission drives, the time of the way there, and why there is none; from the place before.
 
-    `problem` is null where there is a way that is free of collisions.
+    `problem` is null where there is a way that is free of collisions; `flange_m` has points of it, those of the flange from
+    the arm's base, in order.
     """
 
     step: str
     what: str
     way_s: float | None
     problem: str | None
+    flange_m: list[list[float]] = []
 
 
 class MissionPlan(Result):

@@ -74,7 +74,8 @@ class MissionTold(BaseModel):
 def mission(context: OperationContext, request: MissionAsked) -> MissionTold:
     """Plan one station, or stand still until it is cancelled."""
     if request.dry_run:
-        station = {"step": "read", "what": "close-up of setpoint", "way_s": 1.5, "problem": None}
+        way = [[0.3, 0.0, 0.6], [0.4, 0.1, 0.5], [0.5, 0.1, 0.5]]
+        station = {"step": "read", "what": "close-up of setpoint", "way_s": 1.5, "problem": None, "flange_m": way}
         times = {"ways_s": 1.5, "contact_s": 0.0, "expected_s": 1.5}
         return MissionTold(plan={"stations": [station], "is_possible": True, "located": True, **times})
     context.task.progress(0.1, "close-up", "setpoint")

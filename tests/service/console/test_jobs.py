@@ -53,6 +53,29 @@ def test_a_point_of_the_trend_shows_its_reading_and_reports_are_searched(page: A
     until(page, "document.querySelector('.main').textContent.includes('0 of 1 reports')")
 
 
+def test_the_cell_shows_the_planned_way_the_force_and_the_points_of_the_scanner(page: Any, cell: Cell) -> None:
+    page.goto(f"{cell.url}/missions")
+    page.click("[data-mission=demo]")
+    page.click("button:text-is('Dry run'):not([disabled])")
+    until(page, "document.querySelector('.main').textContent.includes('Every place can be reached')")
+    page.goto(f"{cell.url}/cell")
+    until(page, "document.querySelector('.main').textContent.includes('The green way is the dry run of demo.')")
+    until(page, "document.querySelector('.main').textContent.includes('Contact force')")
+    drawn = "[...getElement(Number(document.querySelector('.scene').id.slice(1))).objects.values()].map(one => one.mesh)"
+    until(page, f"{drawn}.filter(one => one.type === 'Line').length >= 2")
+    assert not page.evaluate(f"{drawn}.some(one => one.type === 'Points')"), "a look at the page reads no scanner"
+    page.click('button:text-is("Show the scanner\'s points")')
+    until(page, f"{drawn}.some(one => one.type === 'Points' && one.geometry.attributes.position.count > 0)")
+    page.goto(f"{cell.url}/missions")
+    page.click("button:text-is('Run mission'):not([disabled])")
+    until(page, "document.querySelector('.steps').textContent.includes('Holding')")
+    page.click("button:text-is('Cancel'):not([disabled])")
+    until(page, "document.querySelector('.steps').textContent.includes('cancelled')")
+    page.goto(f"{cell.url}/cell")
+    until(page, "document.querySelector('.main').textContent.includes('Contact force')")
+    assert "The green way" not in page.inner_text(".main"), "the arm has moved since it was planned"
+
+
 def test_readings_are_reviewed_by_keys_one_after_the_other(page: Any, cell: Cell) -> None:
     history = cell.service.service.plant.history
     asked = {"object": "setpoint", "kind": "slider", "unit": "%", "sigma": 2.0, "confidence": 0.4, "doubt": "it is dim"}

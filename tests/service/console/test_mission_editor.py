@@ -42,7 +42,9 @@ def test_a_mission_is_written_by_form_and_text_checked_and_saved(page: Any, cell
     step.get_by_label("Object to set").click()
     page.click("[role=option]:has-text('SETPOINT')")
     step.get_by_label("Target %").fill("140")
-    holds(page, lambda file: file["steps"][1] == {"kind": "set", "name": "step_1", "object": "setpoint", "value": 140.0})
+    holds(
+        page, lambda file: file["steps"][1] == {"kind": "set", "name": "step_1", "object": "setpoint", "value": 140.0}
+    )
     until(page, "document.querySelector('.faults').textContent.includes('steps.1.object')")
     assert page.locator(SAVED).count() == 0
     step.get_by_label("Target %").fill("40")

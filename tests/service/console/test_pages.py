@@ -16,7 +16,18 @@ from tests.service.console.served import Cell, leave_mission, until
 from tests.service.waiting import eventually
 
 pytestmark = NEEDS_CHROMIUM
-PAGES = ("/", "/missions", "/rounds", "/alarms", "/review", "/history", "/devices", "/setup", "/cell", "/mission-editor")
+PAGES = (
+    "/",
+    "/missions",
+    "/rounds",
+    "/alarms",
+    "/review",
+    "/history",
+    "/devices",
+    "/setup",
+    "/cell",
+    "/mission-editor",
+)
 
 
 def test_the_panel_shows_and_a_new_reading_appears_by_itself(page: Any, cell: Cell) -> None:

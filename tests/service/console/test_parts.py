@@ -20,7 +20,7 @@ from hal.camera_model import project
 from hal.panel import NumberGoal, Panel, load_panel
 from hal.panel.limits import Limits
 from manipulation import Kinematics
-from service.console.cell_page import joint_frames
+from service.console.cell_scene import joint_frames
 from service.console.devices_page import shown_value
 from service.console.history_page import fits
 from service.console.mirror import Mirror
@@ -29,6 +29,7 @@ from service.console.missions_page import plan_table
 from service.console.object_facts import history_html
 from service.console.own_page import is_own
 from service.console.panel_drawing import overlay_svg, panel_svg
+from service.console.range_points import points_of
 from service.console.relay import PICTURES
 from service.console.service_client import ServiceClient
 from service.console.setup_page import checks
@@ -68,7 +69,7 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
                 and isinstance(node.args[0], ast.Constant)
             ):
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
-    groups = "nav mode state verb column stop step did plan.station alarm limits alarms.do alarms.ask alarms.confirm"
+    groups = "editor.kind editor.on_failure editor.is editor.move editor.number nav mode state verb column stop step did plan.station alarm limits alarms.do alarms.ask alarms.confirm"
     built = tuple(
         f"{group}." for group in f"{groups} history.span history.outcome role weekday run".split()
     )  # keys that are put together
@@ -146,6 +147,25 @@ def test_the_drawn_arm_is_the_arm_that_plans() -> None:
     q_rad = np.array([0.3, 0.8, -0.9, 0.4, 1.1, -0.2])
     flange = joint_frames(told["links"], q_rad.tolist())[-1]
     assert np.allclose(flange.as_matrix(), Kinematics.of(arm).flange(q_rad).as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize("projection", ["pinhole", "orthographic", "polar"])
+def test_the_points_of_a_range_image_lie_where_the_scanner_measured_them(projection: Any) -> None:
+    plain = {"fx": 50.0, "fy": 40.0, "cx": 3.0, "cy": 0.5, "first_angle_rad": -0.4, "step_angle_rad": 0.1}
+    shape = {"width": 9, "height": 1 if projection == "polar" else 2}
+    depth = np.full((shape["height"], 9), np.nan, np.float32)
+    depth[-1, 2], depth[0, 8] = 0.5, 0.25
+    found = points_of(depth, {"projection": projection, **plain, **shape})
+    if projection == "polar":
+        turned = [Rotation.from_euler("y", -0.4 + 0.1 * k).apply([0.0, 0.0, z]) for k, z in ((2, 0.5), (8, 0.25))]
+        assert np.allclose(found, turned)
+        return
+    lens = np.array([[50.0, 0.0, 3.0], [0.0, 40.0, 0.5], [0.0, 0.0, 1.0]])
+    flat = found / found[:, 2:] if projection == "pinhole" else np.column_stack([found[:, :2], np.ones(2)])
+    assert np.allclose(lens @ flat.T, np.array([[8.0, 0.0, 1.0], [2.0, 1.0, 1.0]]).T)
+    assert np.allclose(found[:, 2], [0.25, 0.5])
+    many = points_of(np.ones((400, 400), np.float32), {"projection": projection, **plain, "width": 400, "height": 400})
+    assert 5000 < len(many) <= 6000
 
 
 @pytest.mark.parametrize(

@@ -171,6 +171,10 @@ def test_a_mission_is_planned_without_motion_and_ends_before_contact_when_a_cond
         stood = context.connection.mover.state().position_rad.tolist()
         plan = run_mission(context, MissionRequest(file="demo", dry_run=True)).plan
         assert plan is not None and plan.is_possible and not plan.located
+        ends = [station.flange_m[-1] for station in plan.stations]
+        assert [station.flange_m[0] for station in plan.stations[1:]] == ends[:-1], (
+            "each way begins where the last ended"
+        )
         assert {"overview", "park"} <= {station.what for station in plan.stations}
         assert [station.step for station in plan.stations].count("operate") == 4
         assert plan.expected_s == pytest.approx(plan.ways_s + plan.contact_s) and 30.0 < plan.expected_s < 300.0

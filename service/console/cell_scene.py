@@ -1,0 +1,183 @@
+"""What the drawing of the cell in 3-D shows: arm, panel, camera's view, wrench, planned way and scanner's points."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from hal.arrays import Array
+from hal.geometry import from_json
+from service.console.mirror import Mirror
+from service.console.poses import base_from, frames_of, lens_of
+
+FRUSTUM_M = 0.35
+JOINT_M, LINK_M = 0.05, 0.04  # for the eye; the planner has its own radii
+SIGMAS_SHOWN = 3.0 * 10.0  # three standard deviations, ten times enlarged
+ARM, PLATE, VIEW, HAZE = "#2f6fd0", "#8894a0", "#e08600", "#c03a78"
+FORCE, WAY, PLACE, POINTS = "#b3150d", "#1d7a4c", "#0f5132", (0.35, 0.2, 0.6)
+FORCE_M_PER_N = 0.01
+LEAST_N = 1.0  # less is the noise of a force sensor that touches nothing
+SHAFT_M, HEAD_M, HEAD_LONG_M = 0.008, 0.02, 0.05
+STATION_M, POINT_M = 0.015, 0.004
+
+
+def joint_frames(links: list[dict[str, float]], position_rad: list[float]) -> list[RigidTransform]:
+    """Return base_from_link of each link, base first, by the Denavit-Hartenberg parameters of the arm.
+
+    The rows are those of `hal.devices.DhLink`: turn by the joint about z, shift d along z, shift a along x, turn alpha about x.
+    """
+    frames = [RigidTransform.identity()]
+    for link, angle in zip(links, position_rad, strict=True):
+        turn = Rotation.from_euler("z", angle + link["offset_rad"])
+        about_z = RigidTransform.from_components([0.0, 0.0, link["d_m"]], turn)
+        along_x = RigidTransform.from_components([link["a_m"], 0.0, 0.0], Rotation.from_euler("x", link["alpha_rad"]))
+        frames.append(frames[-1] * about_z * along_x)
+    return frames
+
+
+class CellScene:
+    """What the scene shows, renewed only where the service said something new."""
+
+    def __init__(self, scene: Any, mirror: Mirror) -> None:
+        self._scene = scene
+        self._mirror = mirror
+        self._parts: dict[str, tuple[Any, list[Any]]] = {}
+        self._points: list[list[float]] | None = None
+        self._force: list[float] | None = None
+        self._arrow: tuple[Any, Any] | None = None
+        self._arm_parts: list[tuple[Any, Any]] = []
+
+    def renew(self) -> None:
+        """Draw again what has changed."""
+        frames = frames_of(self._mirror)
+        points = self._arm_points()
+        if points is not None and points != self._points:
+            self._points = points
+            with self._scene:
+                self._arm(points)
+        self._draw_force()
+        planned = self._mirror.planned
+        self._part("way", [] if planned is None else planned["result"]["plan"]["stations"], self._way)
+        self._part("panel", frames.get("panel"), self._panel)
+        camera = next((one["name"] for one in self._devices() if one["kind"] == "camera"), None)
+        seen = base_from(frames, camera) if camera is not None else None
+        lens = lens_of(self._mirror, camera) if camera is not None else None
+        if seen is not None and lens is not None:
+            wide = np.array([lens.width_px / lens.fx_px, lens.height_px / lens.fy_px]) * FRUSTUM_M / 2
+            corners = np.array([[x, y, FRUSTUM_M] for x, y in ([-1, -1], [1, -1], [1, 1], [-1, 1]) * wide])
+            self._part("view", np.round([seen.translation, *seen.apply(corners)], 4).tolist(), self._view)
+
+    def show_points(self, points_m: Array) -> None:
+        """Draw points (N, 3) in the frame of the base, in place of those before."""
+        self._part("points", np.round(points_m, 4).tolist(), self._cloud)
+
+    def _devices(self) -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = self._mirror.said("devices", {"devices": []})["devices"]
+        return found
+
+    def _arm_points(self) -> list[list[float]] | None:
+        model, robot = self._mirror.said("arm_model"), self._mirror.robot
+        if model is None or robot is None or not model["capabilities"]:
+            return None
+        frames = joint_frames(model["capabilities"]["links"], robot["position_rad"])
+        points: list[list[float]] = np.round([frame.translation for frame in frames], 3).tolist()
+        return points
+
+    def _part(self, name: str, said: Any, draw: Any) -> None:
+        before = self._parts.get(name)
+        if said is None or (before is not None and before[0] == said):
+            return
+        for old in before[1] if before is not None else []:
+            old.delete()
+        with self._scene:
+            self._parts[name] = (said, draw(said))
+
+    def _arm(self, points: list[list[float]]) -> None:
+        """Draw joints and links once and move them afterwards, which costs a browser little."""
+        links = list(itertools.pairwise(np.array(points)))
+        if not self._arm_parts:
+            lengths = [float(np.linalg.norm(b - a)) for a, b in links]
+            self._arm_parts = [
+                (self._scene.sphere(JOINT_M).material(ARM), self._scene.cylinder(LINK_M, LINK_M, length).material(ARM))
+                for length in (max(length, 1e-3) for length in lengths)
+            ]
+        for (a, b), (joint, rod) in zip(links, self._arm_parts, strict=True):
+            joint.move(*b)
+            rod.move(*((a + b) / 2))
+            if np.linalg.norm(b - a) > 1e-3:
+                turn, _ = Rotation.align_vectors([b - a], [[0.0, 1.0, 0.0]])  # a cylinder lies along y
+                rod.rotate_R(turn.as_matrix().tolist())
+
+    def _draw_force(self) -> None:
+        """Draw the contact force at the flange as an arrow; it is made once and moved afterwards."""
+        robot = self._mirror.robot
+        if robot is None:
+            return
+        flange = from_json(robot["base_from_flange"])
+        force_n = flange.rotation.apply(robot["wrench"][:3])
+        newest = np.round([*flange.translation, *force_n], 2).tolist()
+        if newest == self._force:
+            return
+        self._force = newest
+        size_n = float(np.linalg.norm(force_n))
+        if self._arrow is None:
+            with self._scene:
+                shaft = self._scene.cylinder(SHAFT_M, SHAFT_M, 1.0).material(FORCE)
+                self._arrow = (shaft, self._scene.cylinder(0.0, HEAD_M, HEAD_LONG_M).material(FORCE))
+        shaft, head = self._arrow
+        for part in self._arrow:
+            part.visible(size_n >= LEAST_N)
+        if size_n >= LEAST_N:
+            length_m, along = FORCE_M_PER_N * size_n, force_n / size_n
+            turn = Rotation.align_vectors([along], [[0.0, 1.0, 0.0]])[0].as_matrix().tolist()  # a cylinder lies along y
+            shaft.scale(1.0, length_m, 1.0).move(*(flange.translation + along * length_m / 2)).rotate_R(turn)
+            head.move(*(flange.translation + along * (length_m + HEAD_LONG_M / 2))).rotate_R(turn)
+
+    def _way(self, stations: list[dict[str, Any]]) -> list[Any]:
+        """Draw the way of the flange through the stations of a plan, with a ball at each."""
+        drawn = []
+        for one in stations:
+            drawn += [
+                self._scene.line(start, end).material(WAY) for start, end in itertools.pairwise(one.get("flange_m", []))
+            ]
+            if one.get("flange_m"):
+                drawn.append(self._scene.sphere(STATION_M).move(*one["flange_m"][-1]).material(PLACE))
+        return drawn
+
+    def _cloud(self, points: list[list[float]]) -> list[Any]:
+        return [self._scene.point_cloud(points, [list(POINTS)] * len(points), POINT_M)] if points else []
+
+    def _panel(self, frame: dict[str, Any]) -> list[Any]:
+        panel, pose = self._mirror.panel, base_from({"panel": frame}, "panel")
+        if panel is None or pose is None:
+            return []
+        turn = pose.rotation.as_matrix().tolist()
+        middle = pose.apply([0.0, 0.0, -panel.thickness_m / 2])
+        plate = (
+            self._scene.box(panel.width_m, panel.height_m, panel.thickness_m)
+            .move(*middle)
+            .rotate_R(turn)
+            .material(PLATE)
+        )
+        drawn = [plate]
+        for one in panel.objects:
+            height = one.envelope().height_m
+            half_w, half_h = one.half_footprint_m
+            at = pose.apply([*one.position_m, height / 2])
+            drawn.append(
+                self._scene.box(2 * half_w, 2 * half_h, height).move(*at).rotate_R(turn).material("#4c5d6d", 0.8)
+            )
+        if frame["covariance"] is not None:
+            sizes, axes = np.linalg.eigh(np.array(frame["covariance"])[:3, :3])
+            axes = axes * [1.0, 1.0, np.linalg.det(axes)]
+            ball = self._scene.sphere(1.0).scale(*(SIGMAS_SHOWN * np.sqrt(np.maximum(sizes, 1e-12))))
+            drawn.append(ball.move(*pose.translation).rotate_R(axes.tolist()).material(HAZE, 0.5))
+        return drawn
+
+    def _view(self, points: list[list[float]]) -> list[Any]:
+        eye, *corners = points
+        edges = [(eye, corner) for corner in corners] + list(zip(corners, [*corners[1:], corners[0]], strict=True))
+        return [self._scene.line(start, end).material(VIEW) for start, end in edges]

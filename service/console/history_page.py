@@ -9,6 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from hal.panel import PanelObject
+from service.console.comparison import Comparison
 from service.console.mirror import Mirror
 from service.console.missions_page import REPORT_COLUMNS, began_s, report_row
 from service.console.page_frame import Place, attempt, button, clock, live, page_frame, picks, table
@@ -34,6 +35,9 @@ def install(place: Place) -> None:
             with ui.element("section").classes("card"):
                 ui.html(say("history.heading"), sanitize=False, tag="h2")
                 _Trends(mirror, object)
+            with ui.element("section").classes("card"):
+                ui.html(say("compare.heading"), sanitize=False, tag="h2")
+                Comparison(mirror)
             with ui.element("section").classes("card"):
                 ui.html(say("history.reports"), sanitize=False, tag="h2")
                 search = _Search(mirror)

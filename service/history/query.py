@@ -99,6 +99,21 @@ class Reader:
                 rows += db.execute(live, [*values, after, limit - len(rows)]).fetchall()
         return [_row(row) for row in rows]
 
+    def last(self, query: Query, *, limit: int) -> list[Row]:
+        """Return the newest `limit` readings, in the order in which they were stored.
+
+        Raises:
+            HistoryError, Unsupported: as for `page`.
+        """
+        where, values = query.where()
+        with self._open() as db:
+            live = f"SELECT {SELECTED} FROM readings {where} ORDER BY id DESC LIMIT ?"
+            rows = db.execute(live, [*values, limit]).fetchall()
+            if len(rows) < limit:
+                tail = f"{where} ORDER BY id DESC LIMIT {int(limit) - len(rows)}"
+                rows += read_parts(self._older(db), SELECTED, tail, values)
+        return [_row(row) for row in sorted(rows, key=lambda row: int(row[0]))[-limit:]]
+
     def all(self, query: Query) -> Iterator[Row]:
         """Yield all readings, in pages, so that writing is never held up."""
         after = 0

@@ -148,6 +148,9 @@ async def show_history(
     until_s: Moment = None,
     after: Annotated[int, Query(ge=0, lt=2**62, description="only readings with a larger id")] = 0,
     limit: Annotated[int, Query(ge=1, le=1000, description="most readings of one page")] = 200,
+    last: Annotated[
+        int, Query(ge=0, le=1000, description="0: pages from the oldest on. Otherwise only the newest so many readings")
+    ] = 0,
     buckets: Annotated[
         int, Query(ge=0, le=2000, description="0: readings. Otherwise least, greatest and mean value of so many spans")
     ] = 0,
@@ -157,6 +160,9 @@ async def show_history(
     if buckets:
         found = await state.in_thread(functools.partial(reader.trend, question, buckets=buckets))
         return HistoryPage(object=object, buckets=[BucketView(**asdict(bucket)) for bucket in found])
+    if last:
+        newest = await state.in_thread(functools.partial(reader.last, question, limit=last))
+        return HistoryPage(object=object, readings=[reading_view(row) for row in newest])
     rows = await state.in_thread(functools.partial(reader.page, question, after=after, limit=limit))
     return HistoryPage(
         object=object,

@@ -53,6 +53,25 @@ def test_a_point_of_the_trend_shows_its_reading_and_reports_are_searched(page: A
     until(page, "document.querySelector('.main').textContent.includes('0 of 1 reports')")
 
 
+def test_values_are_compared_with_those_of_last_time_and_of_a_week_before(page: Any, cell: Cell) -> None:
+    history, now_s = cell.service.service.plant.history, time.time()
+    given = {"object": "setpoint", "kind": "slider", "unit": "%", "sigma": 0.3}
+    made = [
+        (now_s - 8 * 86_400, 10.0, "t1"),
+        (now_s - 60, 60.0, "t2"),
+        (now_s - 2, 61.0, "t3"),
+        (now_s - 1, 63.5, "t3"),
+    ]
+    history.add([reading(0, value, utc_s=at_s, task=task, **given) for at_s, value, task in made])
+    page.goto(f"{cell.url}/history?object=setpoint")
+    found = (
+        "[...document.querySelectorAll('[aria-label=\"Compare with before\"] tr')].map(one => one.textContent).join()"
+    )
+    until(page, f"{found}.includes('63.5 %') && {found}.includes('60.0 %') && {found}.includes('+3.5 %')")
+    page.click("[data-against=week]")
+    until(page, f"{found}.includes('10.0 %') && {found}.includes('+53.5 %')")
+
+
 def test_the_cell_shows_the_planned_way_the_force_and_the_points_of_the_scanner(page: Any, cell: Cell) -> None:
     page.goto(f"{cell.url}/missions")
     page.click("[data-mission=demo]")
@@ -61,7 +80,9 @@ def test_the_cell_shows_the_planned_way_the_force_and_the_points_of_the_scanner(
     page.goto(f"{cell.url}/cell")
     until(page, "document.querySelector('.main').textContent.includes('The green way is the dry run of demo.')")
     until(page, "document.querySelector('.main').textContent.includes('Contact force')")
-    drawn = "[...getElement(Number(document.querySelector('.scene').id.slice(1))).objects.values()].map(one => one.mesh)"
+    drawn = (
+        "[...getElement(Number(document.querySelector('.scene').id.slice(1))).objects.values()].map(one => one.mesh)"
+    )
     until(page, f"{drawn}.filter(one => one.type === 'Line').length >= 2")
     assert not page.evaluate(f"{drawn}.some(one => one.type === 'Points')"), "a look at the page reads no scanner"
     page.click('button:text-is("Show the scanner\'s points")')

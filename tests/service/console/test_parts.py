@@ -21,6 +21,7 @@ from hal.panel import NumberGoal, Panel, load_panel
 from hal.panel.limits import Limits
 from manipulation import Kinematics
 from service.console.cell_scene import joint_frames
+from service.console.comparison import change_of, earlier
 from service.console.devices_page import shown_value
 from service.console.history_page import fits
 from service.console.mirror import Mirror
@@ -69,7 +70,8 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
                 and isinstance(node.args[0], ast.Constant)
             ):
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
-    groups = "editor.kind editor.on_failure editor.is editor.move editor.number nav mode state verb column stop step did plan.station alarm limits alarms.do alarms.ask alarms.confirm"
+    groups = "editor.kind editor.on_failure editor.is editor.move editor.number compare.against"
+    groups += " nav mode state verb column stop step did plan.station alarm limits alarms.do alarms.ask alarms.confirm"
     built = tuple(
         f"{group}." for group in f"{groups} history.span history.outcome role weekday run".split()
     )  # keys that are put together
@@ -241,6 +243,32 @@ def test_values_of_devices_have_units_and_names() -> None:
     assert shown_value("lights", [True, False]) == "lights on off"
     assert shown_value("gripper", {"width_m": 0.04, "is_moving": False}) == "width 0.04 m, moving no"
     assert shown_value("force_torque", {"force_n": [1.0, 2.5, 0.0]}) == "force 1 2.5 0 N"
+
+
+def test_a_change_is_sure_only_beyond_both_uncertainties(panel: Panel) -> None:
+    gauge, valve = panel.object("pressure"), panel.object("main_valve")
+    newest = reading("pressure", unit="bar", value=4.0, sigma=0.1, utc_s=20.0)
+    assert change_of(gauge, newest, reading("pressure", unit="bar", value=3.8, sigma=0.1, utc_s=10.0)) == (
+        False,
+        "+0.2 bar",
+    )
+    assert change_of(gauge, newest, reading("pressure", unit="bar", value=4.4, sigma=0.1, utc_s=10.0)) == (
+        True,
+        "−0.4 bar",
+    )
+    refused = reading("pressure", quality="invalid", cause="glare", utc_s=10.0)
+    assert change_of(gauge, newest, refused) == (False, "cannot be told")
+    assert change_of(gauge, refused, refused) == (False, "cannot be told")
+    assert change_of(gauge, newest, None) == (False, "–")
+    states = [reading("main_valve", state=state, utc_s=10.0) for state in ("open", "open", "closed")]
+    assert change_of(valve, states[0], states[1]) == (False, "the same")
+    assert change_of(valve, states[0], states[2]) == (True, "changed")
+
+
+def test_last_time_is_the_task_before_however_often_one_task_reads() -> None:
+    rows = [{"id": k, "task": task} for k, task in enumerate(["a", "b", "b", "c", "c"])]
+    assert earlier(rows[-1], rows) == rows[2]
+    assert earlier(rows[0], rows) is None
 
 
 def test_a_trend_has_its_band_in_the_words_of_the_object_and_no_refused_reading(panel: Panel) -> None:

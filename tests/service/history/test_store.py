@@ -43,6 +43,7 @@ def test_readings_come_back_as_they_were_stored_page_by_page(tmp_path: Path) -> 
     first = reader.page(question, limit=4)
     second = reader.page(question, after=first[-1].id, limit=4)
     assert [row.reading for row in (*first, *second)] == readings
+    assert [row.reading for row in reader.last(question, limit=2)] == readings[-2:]
     assert [
         row.reading for row in reader.page(history.ask(object="pressure", since_s=NOW_S + 2, until_s=NOW_S + 3))
     ] == (readings[2:4])
@@ -116,6 +117,7 @@ def test_readings_that_leave_the_database_stay_in_parquet_and_are_read_as_one(tm
     reader, question = history.reader(), history.ask(object="pressure")
     assert [row.reading for row in reader.all(question)] == [*old, *new]
     assert [row.reading for row in reader.page(question, after=3, limit=5)] == [*old[3:], *new[:2]]
+    assert [row.reading for row in reader.last(question, limit=7)] == [*old[-2:], *new]
     first, last = reader.trend(question, buckets=2)
     assert (first.count, first.refused, first.mean, last.mean) == (6, 1, 3.0, 12.0)
     (part,) = (tmp_path / "parts").iterdir()

@@ -77,6 +77,15 @@ class Exposure:
             frozenset({*self.proxies, *([""] if self.unix_socket is not None else [])}) if self.behind_proxy else None
         )
 
+    def of_console(self) -> list[str]:
+        """Return the arguments of the console's process by which it is reached as the service is."""
+        given = [("--name", name) for name in sorted({*map(_bare, self.names), self.host.lower()})]
+        if self.behind_proxy:
+            given += [("--proxy", address) for address in (*self.proxies, "")]
+        if self.tls_cert is not None and self.tls_key is not None:
+            given += [("--tls-cert", str(self.tls_cert.absolute())), ("--tls-key", str(self.tls_key.absolute()))]
+        return [part for pair in given for part in pair] + ([] if self.is_local else ["--exposed"])
+
     def check(self, book: KeyBook) -> None:
         """Check that strangers cannot use the service.
 

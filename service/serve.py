@@ -103,7 +103,7 @@ class Panelwright:
         self._server: HttpServer | None = None
         self._listeners = [listener, *for_proxy]
         self._hosts, self._origins = exposure.names_at(self.port)
-        console = _console_listener(options, self.port) if options.console and is_open_here(options) else None
+        console = _console_listener(options, self.port) if options.console else None
         readers = self._origins  # of the stop port's answers
         if console is not None:
             readers |= exposure.names_at(console.getsockname()[1])[1]
@@ -127,6 +127,7 @@ class Panelwright:
                 cookie=self._cookie,
                 report=self.service.note,
                 keep=self.service.lease.subs.kept_of_console,
+                exposure=exposure.of_console(),
             )
 
         self.gateway = self._gateway_host(cell, options)
@@ -153,7 +154,7 @@ class Panelwright:
     @property
     def console_url(self) -> str | None:
         """Address of the console; None without one."""
-        return None if self.console is None else f"http://{self._exposure.stop_host}:{self.console.port}"
+        return None if self.console is None else self._exposure.url(self.console.port)
 
     @property
     def error(self) -> CellError | None:
@@ -307,19 +308,14 @@ class Panelwright:
         freeze_loaded()
 
 
-def is_open_here(options: Options) -> bool:
-    """Return whether the console may be started: it has no TLS, so it serves this machine only."""
-    return options.exposure.is_local and options.exposure.tls_cert is None
-
-
 def _console_listener(options: Options, port: int) -> socket.socket:
     """Return the console's bound socket; a port that nobody asked for by number may be any free one."""
     if options.console_port is not None:
-        return bound_socket(options.exposure.stop_host, options.console_port, option="--console-port")
+        return bound_socket(options.exposure.host, options.console_port, option="--console-port")
     try:
-        return bound_socket(options.exposure.stop_host, options.port and port + 2)
+        return bound_socket(options.exposure.host, options.port and port + 2)
     except CellError:
-        return bound_socket(options.exposure.stop_host, 0)
+        return bound_socket(options.exposure.host, 0)
 
 
 def exit_on_sigterm() -> None:

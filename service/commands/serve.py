@@ -104,7 +104,7 @@ def serve(
         if early is not None:
             panelwright.service.supervisor.begin_with(early)
         unfinished.pop_all()
-    threading.Thread(target=_announce, args=(panelwright, console_page), daemon=True).start()
+    threading.Thread(target=_announce, args=(panelwright,), daemon=True).start()
     console.print(f"panelwright: cell [bold]{loaded.name}[/] ({loaded.file.cell.mode}) is starting")
     run_to_end(panelwright)
 
@@ -148,15 +148,13 @@ def run_to_end(panelwright: Panelwright) -> NoReturn:
     leave(code)
 
 
-def _announce(panelwright: Panelwright, wants_console: bool) -> None:
+def _announce(panelwright: Panelwright) -> None:
     panelwright.wait_until_settled(START_PATIENCE_S)
     if panelwright.error is None and not panelwright.is_ending:  # not after Ctrl-C during the start
         for line in announcement(panelwright.service, panelwright.url, panelwright.stop_url):
             console.print(line)
         if panelwright.console_url is not None:
             console.print(f"panelwright: console at [bold]{panelwright.console_url}[/]")
-        elif wants_console:
-            console.print("panelwright: without the console, which serves this machine only and without TLS")
 
 
 def announcement(service: Service, url: str, stop_url: str) -> Iterator[str]:

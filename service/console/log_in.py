@@ -67,6 +67,12 @@ def _sender(file: Path) -> Callable[[], FileResponse]:
     return lambda: FileResponse(file)
 
 
+def _for_page(cookie: str, request: Request) -> str:
+    """Return a cookie as the page may keep it: one that came over TLS, also to a proxy, goes out over TLS only."""
+    is_https = "https" in (request.url.scheme, request.headers.get("x-forwarded-proto", ""))
+    return f"{cookie}; Secure" if is_https and "secure" not in cookie.lower().split("; ") else cookie
+
+
 async def _passed_on(people: People, request: Request, body: Any) -> Response:
     """Return the service's answer, with the cookie that it sets."""
     try:
@@ -75,5 +81,5 @@ async def _passed_on(people: People, request: Request, body: Any) -> Response:
         return JSONResponse({"detail": error.what, "hint": error.hint}, 503)
     passed = Response(answer.content, answer.status_code, media_type=answer.headers.get("content-type"))
     for cookie in answer.headers.get_list("set-cookie"):
-        passed.headers.append("set-cookie", cookie)
+        passed.headers.append("set-cookie", _for_page(cookie, request))
     return passed

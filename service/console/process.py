@@ -29,7 +29,7 @@ from service.console import (
     setup_page,
 )
 from service.console.log_in import LogInFirst, install_log_in
-from service.console.own_page import OwnPageOnly
+from service.console.own_page import LOCAL, OwnPageOnly, Reach
 from service.console.page_frame import PATHS, Place
 from service.console.people import People
 from service.console.relay import install_relay
@@ -53,13 +53,16 @@ PAGES = (
 )
 
 
-def create_app(people: People, *, port: int, stop_port: int, ready: threading.Event | None = None) -> FastAPI:
+def create_app(
+    people: People, *, port: int, stop_port: int, reach: Reach = LOCAL, ready: threading.Event | None = None
+) -> FastAPI:
     """Return the application of the console.
 
     Args:
         people: those who use it, with their sessions at the service.
         port: its own port, from which a page in the browser finds the stop port, however it was reached.
         stop_port: port of the stop process.
+        reach: how browsers reach it.
         ready: set when it begins to answer.
     """
 
@@ -72,7 +75,7 @@ def create_app(people: People, *, port: int, stop_port: int, ready: threading.Ev
         await people.close()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
-    install_relay(app, people)
+    install_relay(app, people, is_local=reach.is_local)
     install_log_in(app, people)
     nicegui_app.add_static_files("/web", WEB)
     place = Place(port=port, stop_port=stop_port)
@@ -89,7 +92,7 @@ def create_app(people: People, *, port: int, stop_port: int, ready: threading.Ev
         language="en-US",
     )
     app.add_middleware(LogInFirst, people=people, pages=frozenset([*PATHS.values(), mission_editor.PATH]))
-    app.add_middleware(OwnPageOnly)
+    app.add_middleware(OwnPageOnly, reach=reach)
     return app
 
 
@@ -100,14 +103,27 @@ def main() -> None:
     parser.add_argument("--service", required=True, help="address of the HTTP API")
     parser.add_argument("--stop-port", type=int, required=True)
     parser.add_argument("--cookie", required=True, help="name of the cookie in which the service keeps a session")
+    parser.add_argument("--name", action="append", default=[], help="name under which browsers reach it")
+    parser.add_argument(
+        "--proxy", action="append", help="address of a proxy before it; given empty for one of this machine"
+    )
+    parser.add_argument("--exposed", action="store_true", help="other machines reach it")
+    parser.add_argument("--tls-cert")
+    parser.add_argument("--tls-key")
     options = parser.parse_args()
     take_priority(Priority.CLIENT)
     lifeline = Lifeline()
     listener = socket.socket(fileno=options.fd)
     ready = threading.Event()
-    client = ServiceClient(options.service, secret=os.environ.pop(CONSOLE_PROOF, None))
+    client = ServiceClient(options.service, ca=options.tls_cert, secret=os.environ.pop(CONSOLE_PROOF, None))
     people = People(client, cookie=options.cookie)
-    app = create_app(people, port=listener.getsockname()[1], stop_port=options.stop_port, ready=ready)
+    reach = Reach(
+        names=frozenset(options.name),
+        schemes=frozenset({"https" if options.tls_cert else "http", *(["https"] if options.proxy else [])}),
+        peers=frozenset(options.proxy) if options.proxy else None,
+        is_local=not options.exposed,
+    )
+    app = create_app(people, port=listener.getsockname()[1], stop_port=options.stop_port, reach=reach, ready=ready)
 
     def tell() -> None:
         ready.wait()
@@ -120,7 +136,14 @@ def main() -> None:
     for work in (tell, end_with_parent):
         threading.Thread(target=work, daemon=True).start()
     config = uvicorn.Config(
-        app, log_level="warning", access_log=False, server_header=False, timeout_graceful_shutdown=1
+        app,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        proxy_headers=False,
+        ssl_certfile=options.tls_cert,
+        ssl_keyfile=options.tls_key,
     )
     uvicorn.Server(config).run(sockets=[listener])
 

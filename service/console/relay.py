@@ -22,8 +22,13 @@ MEDIA = {".html": "text/html; charset=utf-8", ".json": "application/json", ".pdf
 REPORT_POLICY = "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline' 'self'; frame-ancestors 'none'"
 
 
-def install_relay(app: FastAPI, people: People) -> None:
-    """Add the routes under `/relay` to the console's application."""
+def install_relay(app: FastAPI, people: People, *, is_local: bool = True) -> None:
+    """Add the routes under `/relay` to the console's application.
+
+    Args:
+        is_local: whether only this machine reaches the console. The service lets this machine stop without a key, and
+            takes the console for this machine, so that the console itself asks others for their session.
+    """
 
     @app.get("/relay/stop")
     async def stop_state(request: Request) -> Response:
@@ -31,6 +36,8 @@ def install_relay(app: FastAPI, people: People) -> None:
 
     @app.post("/relay/stop")
     async def stop(request: Request) -> Response:
+        if not is_local and await people.enter(request.cookies) is None:
+            return Response("log in to stop from here\n", 401, media_type="text/plain")
         return await _passed_on(people.client_of(request.cookies), "POST", "/v1/stop", timeout_s=QUICK_S)
 
     @app.post("/relay/stop/reset")

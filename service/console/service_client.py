@@ -13,7 +13,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
 from hal.errors import DeviceUnavailable
-from service.client import ApiError, document
+from service.client import ApiError, document, trusting_only
 from service.console.texts import say
 from service.processes.client_host import CONSOLE_HEADER
 
@@ -26,19 +26,27 @@ class ServiceClient:
 
     Args:
         url: its address, for example `http://127.0.0.1:8460`.
+        ca: the service's certificate, for an address with https.
         secret: proves to the service that its own console asks; None for another program.
         transport: carries the requests; None for the network.
     """
 
     def __init__(
-        self, url: str, *, secret: str | None = None, transport: httpx2.AsyncBaseTransport | None = None
+        self,
+        url: str,
+        *,
+        ca: str | None = None,
+        secret: str | None = None,
+        transport: httpx2.AsyncBaseTransport | None = None,
     ) -> None:
         self.url = url.rstrip("/")
         self._headers: Mapping[str, str] = {} if secret is None else {CONSOLE_HEADER: secret}
+        self._tls = None if ca is None else trusting_only(ca)
         self._http = httpx2.AsyncClient(
             base_url=self.url,
             timeout=TIMEOUT_S,
             trust_env=False,
+            verify=True if self._tls is None else self._tls,
             transport=transport,
             # It keeps no cookie of an answer: the session of one person must never go out with the request of another.
             cookies=CookieJar(policy=DefaultCookiePolicy(allowed_domains=[])),
@@ -101,7 +109,7 @@ class ServiceClient:
         """Yield the state of the robot, 20 times a second, until the connection is lost; problems are left out."""
         address = f"{self.url.replace('http', 'ws', 1)}/v1/stream"
         with contextlib.suppress(WebSocketException, OSError, TimeoutError):
-            async with connect(address, additional_headers=self._headers, proxy=None) as stream:
+            async with connect(address, additional_headers=self._headers, proxy=None, ssl=self._tls) as stream:
                 async for text in stream:
                     sample = document(text, self.url)
                     if "problem" not in sample:

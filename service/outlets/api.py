@@ -11,7 +11,7 @@ from urllib.parse import quote
 import httpx2
 
 from hal.errors import DeviceUnavailable
-from service.client import ApiError
+from service.client import ApiError, trusting_only
 from service.outlets.source import CellState, Changes, Cursor, Instrument, instruments_of
 
 TIMEOUT_S = 10.0
@@ -39,7 +39,7 @@ class ApiSource:
     ) -> None:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         self._may_acknowledge = {} if key_to_acknowledge is None else {"Authorization": f"Bearer {key_to_acknowledge}"}
-        verify: ssl.SSLContext | bool = True if ca is None else ssl.create_default_context(cafile=ca)
+        verify: ssl.SSLContext | bool = True if ca is None else trusting_only(ca)
         self._http = httpx2.AsyncClient(
             base_url=url, headers=headers, timeout=TIMEOUT_S, trust_env=False, verify=verify, transport=transport
         )

@@ -113,6 +113,7 @@ class ConsoleHost(ClientHost):
         stop_port: port of the stop process.
         cookie: name of the cookie in which the service keeps a session.
         keep: keeps the motions that the console began, while it is started again.
+        exposure: further arguments of the process, which say how browsers reach it.
         report, module: see `ClientHost`.
 
     Attributes:
@@ -128,11 +129,13 @@ class ConsoleHost(ClientHost):
         cookie: str,
         report: Callable[[str, dict[str, Any]], None],
         keep: Callable[[], AbstractContextManager[None]] = nullcontext,
+        exposure: Sequence[str] = (),
         module: str = CONSOLE,
     ) -> None:
         fd = listener.fileno()
         self.secret = secrets.token_urlsafe(32)
         arguments = ["--fd", str(fd), "--service", service_url, "--stop-port", str(stop_port), "--cookie", cookie]
+        arguments += exposure
         environment = {CONSOLE_PROOF: self.secret}
         super().__init__(module, arguments, name="console", report=report, pass_fds=[fd], environment=environment)
         self._listener = listener

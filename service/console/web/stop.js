@@ -1,6 +1,7 @@
 // The software stop, without any help of the console: it asks the stop process on its own port, and the service as well.
 // The ports keep the distance that they have on the machine of the cell, so that it works through `ssh -L` of a whole
-// range, through the plain ports, and on the machine itself.
+// range, through the plain ports, and on the machine itself. A page that came over TLS may not ask plain ports of other
+// machines: it asks `/v1/stop` of its own address, which a proxy passes on to the service, without the console.
 (() => {
   const box = document.querySelector("#stop-box");
   const line = document.querySelector("#stop-line");
@@ -8,7 +9,9 @@
   const words = JSON.parse(box.dataset.words);
   const here = Number(location.port || 80);
   const ports = new Set([here + Number(box.dataset.stopPort) - Number(box.dataset.ownPort), Number(box.dataset.stopPort)]);
-  const ways = [...ports].filter((port) => port > 0 && port < 65536).map((port) => `http://${location.hostname}:${port}/v1/stop`);
+  const isPlain = location.protocol === "http:";
+  const plain = [...ports].filter((port) => port > 0 && port < 65536).map((port) => `http://${location.hostname}:${port}/v1/stop`);
+  const ways = isPlain ? plain : ["/v1/stop"];
   const PATIENCE_MS = 3000;
   let count = 0;
   let shownMs = 0;

@@ -12,7 +12,8 @@ from pydantic import BaseModel
 
 from hal.config import load_cell
 from hal.strict import Strict
-from service.access.keys import Role
+from service.access.keys import KeyBook, Role
+from service.exposure import Exposure
 from service.operations import Operation, OperationContext
 from service.serve import Options, Panelwright
 from tests.service.conftest import WriteCell
@@ -83,10 +84,21 @@ def mission(context: OperationContext, request: MissionAsked) -> MissionTold:
     return MissionTold()
 
 
+def _added(book: KeyBook, name: str, role: Role) -> str:
+    return book.add(name, role, valid_s=None, commit=lambda _kind, _data: None)
+
+
 class Cell:
     """A service of fakes with its console. A slider that is set or read is in the history afterwards."""
 
-    def __init__(self, write_cell: WriteCell, folder: Path, *, keys: dict[str, Role] | None = None) -> None:
+    def __init__(
+        self,
+        write_cell: WriteCell,
+        folder: Path,
+        *,
+        keys: dict[str, Role] | None = None,
+        exposure: Exposure | None = None,
+    ) -> None:
         self.trouble = folder / "trouble"  # while it says so, the lights do not connect
         self.trouble.parent.mkdir(parents=True, exist_ok=True)
         self.trouble.write_text("" if keys else "away")
@@ -109,13 +121,17 @@ class Cell:
             )
             for verb in ("manipulate", "inspect")
         }
-        options = Options(port=0, runs_dir=folder, inline=True, partial=True, console=True)
+        runs = folder
+        if exposure is not None:  # a service that others reach must have its keys before it starts
+            book = KeyBook(runs / ".service" / "keys.json")
+            self.secrets = {name: _added(book, name, role) for name, role in (keys or {}).items()}
+        options = Options(
+            port=0, runs_dir=runs, inline=True, partial=True, console=True, exposure=exposure or Exposure()
+        )
         self.service = Panelwright(load_cell(path), options, operations={**OPERATIONS, "missions": holds, **sets})
-        book = self.service.service.keys
-        self.secrets = {
-            name: book.add(name, role, valid_s=None, commit=lambda _kind, _data: None)
-            for name, role in (keys or {}).items()
-        }
+        if exposure is None:
+            book = self.service.service.keys
+            self.secrets = {name: _added(book, name, role) for name, role in (keys or {}).items()}
         self.service.start()
         assert self.console.wait_until_ready(150.0)
 

@@ -70,6 +70,12 @@ class OpcuaSection(Strict):
         str | None, Field(description="PEM; with it, only signed and encrypted connections are taken")
     ] = None
     private_key_file: Annotated[str | None, Field(description="PEM, which only its owner may read")] = None
+    trusted_clients: Annotated[
+        str | None,
+        Field(
+            description="folder with certificates (PEM or DER) of the clients that may connect, or of their authorities"
+        ),
+    ] = None
     acknowledge: Annotated[bool, Field(description="clients may acknowledge alarms; nothing else can be called")] = (
         False
     )
@@ -83,6 +89,8 @@ class OpcuaSection(Strict):
             raise ValueError("username and password_file go together: give both or none")
         if (self.certificate_file is None) != (self.private_key_file is None):
             raise ValueError("certificate_file and private_key_file go together: give both or none")
+        if self.trusted_clients is not None and self.certificate_file is None:
+            raise ValueError("trusted_clients needs certificate_file: a client shows its certificate only if encrypted")
         if self.acknowledge and self.username is None:
             raise ValueError("acknowledge needs username and password_file: else anybody could acknowledge alarms")
         if self.key_file is not None and not self.acknowledge:

@@ -47,6 +47,14 @@ def checked_outlets(section: OutletsSection, folder: Path, *, source: str = "[ou
         path = (folder / getattr(part, key)).absolute()
         faults += _file_faults(path, f"outlets.{outlet}.{key}", is_secret=(outlet, key) in SECRETS)
         section = section.model_copy(update={outlet: part.model_copy(update={key: str(path)})})
+    if section.opcua is not None and section.opcua.trusted_clients is not None:
+        clients = (folder / section.opcua.trusted_clients).absolute()
+        if not clients.is_dir():
+            hint = "make it, and put the certificates of the clients into it"
+            faults.append(FieldFault("outlets.opcua.trusted_clients", f"there is no folder {clients}", hint))
+        section = section.model_copy(
+            update={"opcua": section.opcua.model_copy(update={"trusted_clients": str(clients)})}
+        )
     if faults:
         raise refusal(faults, source=source)
     return section

@@ -2,7 +2,7 @@
 
 Objects/CELL                  ServiceAnswers
 Objects/CELL/NAME             Value (with EURange and EngineeringUnits) or State, Sigma, Confidence, Cause
-Objects/CELL/NAME/KIND        an alarm: State, Active, Message
+Objects/CELL/NAME/KIND        an alarm: an instance of AlarmConditionType, and State
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from hal.outlets import OpcuaSection
 from service.outlets.deliver import Backoff, Sleep, batches
 from service.outlets.opcua_alarms import Conditions
 from service.outlets.opcua_nodes import ObjectNode, add_node
+from service.outlets.opcua_trust import TrustedClients
 from service.outlets.source import Instrument, Memory, Source
 
 NAMESPACE = "urn:panelwright:{cell}"
@@ -99,6 +100,8 @@ class OpcuaOutlet:
             server.set_security_policy(list(ENCRYPTED))
             await server.load_certificate(section.certificate_file)
             await server.load_private_key(Path(section.private_key_file))
+            trusted = None if section.trusted_clients is None else Path(section.trusted_clients)
+            server.set_certificate_validator(TrustedClients(trusted).validate)
         index = await server.register_namespace(f"{uri}:panel")
         root = await server.nodes.objects.add_object(ua.NodeId(self._cell, index), ua.QualifiedName(self._cell, index))
         self._answers = await add_node(root, "ServiceAnswers", path="ServiceAnswers", variable=ua.VariantType.Boolean)

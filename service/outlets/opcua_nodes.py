@@ -53,14 +53,20 @@ async def add_node(
     kind: int = ua.ObjectIds.BaseObjectType,
     variable: ua.VariantType | None = None,
     text: str = "",
+    standard: int | None = None,
 ) -> Node:
-    """Add an object, or a variable that clients cannot write, with a type and without the optional parts of that type."""
+    """Add an object, or a variable that clients cannot write, with a type and without the optional parts of that type.
+
+    Args:
+        standard: the reference from the parent to a part that OPC UA itself names, so that its browse name is of namespace 0;
+            None for a component with a name of ours.
+    """
     index = parent.nodeid.NamespaceIndex
     item = ua.AddNodesItem(
         RequestedNewNodeId=ua.NodeId(path, index),
-        BrowseName=ua.QualifiedName(name, index),
+        BrowseName=ua.QualifiedName(name, index if standard is None else 0),
         ParentNodeId=parent.nodeid,
-        ReferenceTypeId=ua.NodeId(ua.ObjectIds.HasComponent),
+        ReferenceTypeId=ua.NodeId(ua.ObjectIds.HasComponent if standard is None else standard),
         TypeDefinition=ua.NodeId(kind),
     )
     attributes: ua.ObjectAttributes | ua.VariableAttributes

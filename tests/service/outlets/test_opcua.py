@@ -216,6 +216,43 @@ def test_alarms_are_conditions_that_can_be_refreshed_and_acknowledged_only_if_th
     asyncio.run(story())
 
 
+def test_each_alarm_is_an_instance_of_the_standard_type_that_holds_its_newest_state() -> None:
+    async def story() -> None:
+        source = FakeSource()
+        source.alarms_change()
+        async with serving(source) as url, connected(url) as client:
+            await until(client, "pressure.high.State", lambda found: found.Value.Value == "unacknowledged")
+            condition = await node_of(client, "pressure.high")
+            assert (await condition.read_type_definition()).Identifier == ua.ObjectIds.AlarmConditionType
+            (owner,) = await condition.get_referenced_nodes(ua.ObjectIds.HasCondition, ua.BrowseDirection.Inverse)
+            assert owner == await node_of(client, "pressure")
+
+            async def part(path: str) -> Any:
+                return await (await condition.get_child([f"0:{one}" for one in path.split("/")])).read_value()
+
+            assert [await part(f"{one}/Id") for one in ("EnabledState", "ActiveState", "AckedState")] == [
+                True,
+                True,
+                False,
+            ]
+            assert ((await part("AckedState")).Text, (await part("ActiveState")).Text) == ("Unacknowledged", "Active")
+            assert (await part("Severity"), await part("Retain"), await part("SourceName")) == (700, True, "pressure")
+            assert (await part("Message")).Text == "pressure is 7 bar, above 6"
+            assert (await part("Comment/SourceTimestamp")) == await part("Time") == datetime.fromtimestamp(AT_S, UTC)
+            assert len(await part("EventId")) == 16
+            methods = await condition.get_referenced_nodes(ua.ObjectIds.HasComponent, nodeclassmask=ua.NodeClass.Method)
+            assert methods == [], "what the file does not allow is not offered"
+            source.alarms_change(state="shelved", by="alice", reason="test run", changed_s=AT_S + 60)
+            await until(client, "pressure.high.State", lambda found: found.Value.Value == "shelved")
+            assert ((await part("Comment")).Text, await part("ClientUserId")) == ("test run", "alice")
+            assert [await part(one) for one in ("AckedState/Id", "SuppressedOrShelved", "Retain")] == [True, True, True]
+            source.alarms_change(state="normal", is_active=False, changed_s=AT_S + 120)
+            await until(client, "pressure.high.State", lambda found: found.Value.Value == "normal")
+            assert [await part(one) for one in ("ActiveState/Id", "Retain", "Severity")] == [False, False, 700]
+
+    asyncio.run(story())
+
+
 def test_clients_may_only_look() -> None:
     async def story() -> None:
         source = FakeSource()

@@ -87,6 +87,17 @@ def _several(page: Page, _service: Served) -> None:
     until(page, "document.querySelector('tbody').textContent.includes('TEMPERATURE')")
 
 
+def _checked(page: Page, _service: Served) -> None:
+    until(page, "document.querySelector('.main').textContent.includes('It has no fault')")
+
+
+def _pointed(page: Page, service: Served) -> None:
+    """Show the way of a dry run and the scanner's points."""
+    service.end("/v1/missions", {"file": "inspect", "dry_run": True})
+    until(page, "document.querySelector('.main').textContent.includes('The green way')")
+    page.click('button:text-is("Show the scanner\'s points")')
+
+
 PICTURES: dict[str, tuple[str, Callable[[Page, Served], None]]] = {
     "panel": ("/", _drawn),
     "object": ("/", _opened),
@@ -97,7 +108,8 @@ PICTURES: dict[str, tuple[str, Callable[[Page, Served], None]]] = {
     "history": ("/history?object=pressure", _several),
     "devices": ("/devices", _nothing),
     "setup": ("/setup", _nothing),
-    "cell": ("/cell", _nothing),
+    "cell": ("/cell", _pointed),
+    "mission-editor": ("/mission-editor?mission=demo", _checked),
 }
 
 if __name__ == "__main__":

@@ -87,15 +87,13 @@ def change_of(one: PanelObject, newest: Reading, before: Reading | None) -> tupl
         return False, "–"
     if "valid" not in (newest["quality"], before["quality"]) or newest["quality"] != before["quality"]:
         return False, say("compare.unclear")
-    if one.value_is_angle or (newest["state"] is None and newest["value"] is not None and before["value"] is not None):
+    if None not in (newest["value"], before["value"]) and newest["state"] is None and before["state"] is None:
         return _difference(one, newest, before)
     is_same = shown(one, newest) == shown(one, before)
     return not is_same, say("compare.same" if is_same else "compare.changed")
 
 
 def _difference(one: PanelObject, newest: Reading, before: Reading) -> tuple[bool, str]:
-    if newest["value"] is None or before["value"] is None:
-        return False, say("compare.unclear")
     difference = newest["value"] - before["value"]
     sigma = math.hypot(newest["sigma"] or 0.0, before["sigma"] or 0.0)
     told = number(one, abs(difference), {**newest, "sigma": sigma})

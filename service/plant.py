@@ -75,6 +75,8 @@ class Plant:
         self._is_closing = threading.Event()
         self.check_rounds(cell.file.rounds, source=str(cell.path))
         self._book = RoundBook(state_dir / "rounds" / f"{cell.name}.sqlite")
+        if self._book.set_aside_now is not None:
+            note("rounds-set-aside", {"file": str(self._book.set_aside_now)})
 
     def keep_rounds(self, running: Callable[[Callable[[str], bool]], RunningCell]) -> None:
         """Prepare the rounds.

@@ -36,15 +36,18 @@ class Limits(Strict):
         given = self.given
         if not given and self.rate_per_s is None:
             raise meant_otherwise("no limit is given", "give low_low, low, high, high_high or rate_per_s")
-        for (name, value), (next_name, next_value) in pairwise(given.items()):
-            if value >= next_value:
-                what = f"{name} = {value:g} is not below {next_name} = {next_value:g}"
-                raise meant_otherwise(what, "the order is low_low < low < high < high_high")
+        faults = {
+            f"{name} = {value:g} is not below {next_name} = {next_value:g}": "the order is low_low < low < high < high_high"
+            for (name, value), (next_name, next_value) in pairwise(given.items())
+            if value >= next_value
+        }
         above = [value for name, value in given.items() if name.startswith("high")]
         below = [value for name, value in given.items() if name.startswith("low")]
         if above and below and self.deadband >= min(above) - max(below):
             what = f"deadband = {self.deadband:g} is not smaller than the room between the limits"
-            raise meant_otherwise(what, "an alarm could never end: give a smaller deadband")
+            faults[what] = "an alarm could never end: give a smaller deadband"
+        if faults:
+            raise meant_otherwise("; ".join(faults), "; ".join(dict.fromkeys(faults.values())))
         return self
 
     @property

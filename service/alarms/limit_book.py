@@ -48,6 +48,8 @@ class LimitBook:
         self._lock = threading.Lock()
         try:
             said = json.loads(path.read_text(encoding="utf-8"))
+            if said.get("schema", SCHEMA) != SCHEMA:
+                raise ValueError(f"another panelwright wrote it (schema {said['schema']}, this one knows {SCHEMA})")
             self._set = {name: _restored(one) for name, one in said["limits"].items()}
         except FileNotFoundError:
             self._set = {}

@@ -54,7 +54,7 @@ def open_history(path: Path) -> tuple[sqlite3.Connection, Path | None]:
         except sqlite3.OperationalError:
             raise  # a full or locked disk is no damage
         except sqlite3.DatabaseError:
-            aside = _set_aside(path)
+            aside = set_aside(path)
             return _opened(path), aside
     except (sqlite3.Error, OSError) as error:
         raise cannot_write(path, error) from error
@@ -122,7 +122,7 @@ def _refuse_newer(path: Path, version: int) -> None:
         )
 
 
-def _set_aside(path: Path) -> Path:
+def set_aside(path: Path) -> Path:
     """Rename a damaged file and what belongs to it; returns the new path."""
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     aside = path.with_name(f"{path.stem}-damaged-{stamp}{path.suffix}")

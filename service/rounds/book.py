@@ -17,6 +17,7 @@ from pathlib import Path
 
 from hal.plant import RoundSection
 from service.errors import HistoryError
+from service.history.database import set_aside
 
 VERSION = 1
 KEEP_RUNS = 10_000
@@ -72,7 +73,10 @@ class Run:
 
 
 class RoundBook:
-    """The record in a SQLite file.
+    """The record in a SQLite file. A damaged one is set aside, and a new one is begun, so that the rounds go on from now.
+
+    Attributes:
+        set_aside_now: new path of a damaged file that was set aside at this start; None if there was none.
 
     Raises:
         HistoryError: the file cannot be used, or is of a newer version. The same holds for every method.
@@ -81,21 +85,38 @@ class RoundBook:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = threading.RLock()
+        self.set_aside_now: Path | None = None
         path.parent.mkdir(parents=True, exist_ok=True)
         with self._errors():
-            self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
-            version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
+            try:
+                self._db = self._opened()
+            except sqlite3.OperationalError:
+                raise  # a full or locked disk is no damage
+            except sqlite3.DatabaseError:
+                self.set_aside_now = set_aside(path)
+                self._db = self._opened()
+
+    def _opened(self) -> sqlite3.Connection:
+        db = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False, timeout=10.0)
+        try:
+            version = int(db.execute("PRAGMA user_version").fetchone()[0])
             if version > VERSION:
-                self._db.close()
                 raise HistoryError(
-                    f"the record of rounds {path} was written by a newer panelwright (version {version})",
+                    f"the record of rounds {self._path} was written by a newer panelwright (version {version})",
                     hint="use that panelwright, or another folder (--runs); the file has not been changed",
-                    file=str(path),
+                    file=str(self._path),
                 )
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")
-            self._db.executescript(SCHEMA)
-            self._db.execute(f"PRAGMA user_version={VERSION}")
+            found = db.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if found != "ok":
+                raise sqlite3.DatabaseError(f"malformed: {found}")
+            db.execute("PRAGMA journal_mode=WAL")
+            db.execute("PRAGMA synchronous=FULL")
+            db.executescript(SCHEMA)
+            db.execute(f"PRAGMA user_version={VERSION}")
+        except BaseException:
+            db.close()
+            raise
+        return db
 
     def settled_s(self, section: RoundSection, now_s: float) -> float:
         """Return the time up to which a round is settled; a new round, or one with another plan, begins now."""

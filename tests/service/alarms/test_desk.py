@@ -226,6 +226,10 @@ def test_what_cannot_be_recorded_does_not_take_place_and_is_made_up_for_later(tm
     ("keys", "words"),
     [
         ({"limits": {"low": 6.0, "high": 5.0}}, "low = 6 is not below high = 5"),
+        (
+            {"limits": {"low_low": 3.0, "low": 2.0, "high": 5.0, "high_high": 4.0, "deadband": 9.0}},
+            "low_low = 3 is not below low = 2; high = 5 is not below high_high = 4; deadband = 9 is not smaller",
+        ),
         ({"limits": {}}, "no limit is given"),
         ({"limits": {"low": 4.0, "high": 5.0, "deadband": 1.0}}, "deadband = 1"),
         ({"limits": {"high": 5.0, "delay_s": -1.0}}, "greater than or equal to 0"),

@@ -148,6 +148,20 @@ def test_another_cron_expression_makes_up_for_nothing(tmp_path: Path) -> None:
     assert one.states() == []
 
 
+def test_a_damaged_record_is_set_aside_and_the_rounds_go_on_from_now(tmp_path: Path) -> None:
+    one = rig(tmp_path)
+    one.book.close()
+    path = tmp_path / "rounds.sqlite"
+    torn = b"no database" * 500
+    path.write_bytes(torn)
+    for beside in ("-wal", "-shm"):
+        path.with_name(path.name + beside).unlink(missing_ok=True)
+    one.start()
+    assert one.book.set_aside_now is not None
+    assert one.book.set_aside_now.read_bytes() == torn
+    assert one.states() == []
+
+
 def test_a_record_of_a_newer_version_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
     one = rig(tmp_path)
     one.book._db.execute("PRAGMA user_version=99")

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import astuple
 from pathlib import Path
 
 from hal.errors import CellError
@@ -89,7 +88,7 @@ class History:
         """
         if not readings:
             return
-        rows = [(self._cell, self._panel, *astuple(reading)) for reading in readings]
+        rows = [(self._cell, self._panel, *(getattr(reading, name) for name in COLUMNS)) for reading in readings]
         with self._lock:
             try:
                 self._insert(rows)

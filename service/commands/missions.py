@@ -39,13 +39,12 @@ def list_missions(cell: CellOption = DEFAULT_CELL) -> None:
 def check_mission(name: Name, cell: CellOption = DEFAULT_CELL) -> None:
     """Check a mission file against a cell's panel; nothing moves, and no service is needed."""
     from hal.config import load_cell
-    from hal.strict import load_toml
-    from service.missions.files import checked, checked_file
-    from service.schema.mission_file import MissionFile
+    from hal.strict import read_text
+    from service.missions.files import FILE, checked, checked_file, parse_mission
 
     loaded = load_cell(find_cell(cell))
     if name.endswith(".toml"):
-        checked(load_toml(Path(name), MissionFile, "mission file"), loaded, source=name)
+        checked(parse_mission(read_text(Path(name), FILE), loaded.panel, source=name), loaded, source=name)
     else:
         checked_file(name, loaded)
     console.print(f"{name} fits panel {loaded.panel.name}", style="green")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
 import ssl
 import threading
 from pathlib import Path
 
 HEAD_END = b"\r\n\r\n"
+RECORD_S = 0.02
 
 
 class TlsProxy:
@@ -52,8 +54,7 @@ class TlsProxy:
                 head += part
             with self._backend(head) as backend:
                 backend.sendall(_forwarded(head))
-                threading.Thread(target=_pipe, args=(browser, backend), daemon=True).start()
-                _pipe(backend, browser)
+                _join(browser, backend)
 
     def _backend(self, head: bytes) -> socket.socket:
         if head.split(b" ", 2)[1] == b"/v1/stop":
@@ -74,8 +75,17 @@ def _forwarded(head: bytes) -> bytes:
     return b"\r\n".join(lines)
 
 
-def _pipe(source: socket.socket, sink: socket.socket) -> None:
-    with contextlib.suppress(OSError):
-        while part := source.recv(65536):
-            sink.sendall(part)
-        sink.shutdown(socket.SHUT_WR)
+def _join(browser: ssl.SSLSocket, backend: socket.socket) -> None:
+    """Pass bytes on in both directions until one side ends; by one thread, because two may not share a TLS connection."""
+    while True:
+        ready = [browser] if browser.pending() else select.select([browser, backend], [], [])[0]
+        for source in ready:
+            browser.settimeout(RECORD_S)
+            try:
+                part = source.recv(65536)
+            except TimeoutError:  # a record of TLS itself, or the beginning of one
+                continue
+            if not part:
+                return
+            browser.settimeout(None)
+            (backend if source is browser else browser).sendall(part)

@@ -33,6 +33,10 @@ SAME_SPAN_RAD, TURNED_RAD = np.deg2rad([5.0, 3.0])
 # If the middle of another span is farther from straight up, the ticks at one end are not visible.
 LOPSIDED_RAD = np.deg2rad(10.0)
 BY_NUMERALS = 0.75  # largest confidence if the numerals run against what was told, or are not legible
+# Largest confidence of a reading on a narrow scale: in an oblique view the direction may be wrong by 2 degrees, which is
+# more than 2.5 % of it.
+NARROW, NARROW_RAD = 0.75, np.deg2rad(75.0)
+RED_UNASKED = 0.75  # largest confidence of a gauge's red pointer that nobody asked for: it may be that of a limit
 BY_TICKS = (
     0.75  # largest confidence if the ends are not told: one may be off by a tick, or the values may fall clockwise
 )
@@ -70,7 +74,10 @@ def read_dial(
         for hand in hands
         if len(hands) > 1 and (shown := answer_at(status_of(hand.fit), 0.0)).value is not None
     )
-    status = replace(limited(status_of(hands[0].fit), min(hands[0].most, most_of_scale)), pointers=seen)
+    most = min(hands[0].most, most_of_scale)
+    if hands[0].colour == "red" and pointer is None and not circular:
+        most = min(most, RED_UNASKED)
+    status = replace(limited(status_of(hands[0].fit), most), pointers=seen)
     if len(hands) > 1 and pointer is None:
         return doubted(status, _which_is_meant(seen))
     return answer_at(gated(status), least_confidence)
@@ -97,7 +104,8 @@ def _scale_of(
     low, high = ends_rad or _ends(gray, *circle)
     at_min, at_max = (low, high) if first < last else (high, low)
     scale = Scale(minimum=min(values), maximum=max(values), unit="", at_min=at_min, at_max=at_max)
-    return partial(status_of_pointer, scale=scale, seen=1.0), 1.0 if ends_rad else BY_TICKS
+    most = BY_TICKS if ends_rad is None else NARROW if abs(high - low) < NARROW_RAD else 1.0
+    return partial(status_of_pointer, scale=scale, seen=1.0), most
 
 
 def _has_ten_numerals(first: float, last: float) -> bool:

@@ -6,20 +6,20 @@ picture, and the clearest one is used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Image
+from hal.arrays import Array, Image
 from perception.vision.image import WHITE_LEVEL, as_gray
 from perception.vision.patch import Patch
 from perception.vision.photographs.drop import find_drop, with_halo
-from perception.vision.photographs.red_pointer import find_red_pointer, length_of, patch_about, redness, without
+from perception.vision.photographs.red_pointer import find_red_pointer, is_red, length_of, patch_about, redness, without
 from perception.vision.status.gauge import RIVAL, SIGMA_RAD, pointer_confidence
-from perception.vision.status.pointer import PointerFit, PointerSearch, find_pointer, unroll, wrapped
+from perception.vision.status.pointer import PointerFit, PointerSearch, find_pointer, wrapped
 
 Pointer = Literal["black", "red"]
 
@@ -29,17 +29,24 @@ SAME_RAD = np.deg2rad(6.0)  # pointers in different channels with a smaller diff
 COLOUR_OFF_RAD = np.deg2rad(
     14.0
 )  # JPEG stores colours in blocks of 16 px, which may shift a pointer's direction by so much
+ONLY_IN_COLOUR = 0.75  # largest confidence of a pointer that lightness does not show in the same direction
 SHOWN_WELL = 0.5  # confidence from which the direction in lightness is used
 SURE, CONTRADICTED = 0.8, 0.6  # confidence of a certain needle, and of a drop that contradicts it
 RIVALLED = 0.8  # factor on the confidence of an uncertain needle if a drop may point elsewhere
 OTHER_RAD = np.deg2rad(35.0)  # largest angle at which one side of a drop may be taken for a needle
 CLEARER_BY = 0.5  # than the best pointer elsewhere, in units of `_clearness`, for a confidence of one half
 BRIGHT_FACE = 205  # gray level of a face on which saturated parts need not be glare
-PIVOT_OFF = 0.08  # of the radius; in an oblique view the outline is not centred on the pivot
+# Shares of the radius across a pointer: where it may be, because the outline is not centred on the pivot in an oblique
+# view, and the face on both sides.
+STRIP, BESIDE = np.linspace(-0.08, 0.08, 9), np.array([-0.2, -0.16, -0.12, 0.12, 0.16, 0.2])
+HUB_TO = 0.15  # of the radius
+LEAST_RIVAL, RIVAL_CONNECTED = 0.4, 0.5  # a rival with a smaller score does no harm; one that is less connected is none
+NUMERAL_RAD = np.deg2rad(6.0)  # half width of the sector in which a numeral is covered
+MOST_COVERED = 4  # directions
 LEAST_COLOUR = 5.0  # contrast in units of Lab; a smaller one may be noise of the camera or of JPEG
+TIMES_FACE = 0.7  # least contrast of a bright pointer, relative to the face; reflections on a bright face have less
 TWO_RAD = np.deg2rad(12.0)  # two pointers that are nearer are not told apart from one with its shadow
 SECOND = 0.5  # confidence from which a pointer beside a red one counts
-ONE_OF_TWO = 0.75  # largest confidence where a weaker second pointer cannot be excluded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,15 +75,16 @@ def find_hands(picture: Image, circle: tuple[float, float, float], asked: Pointe
         if asked == "red":
             return "no red pointer stands out on the dial: come closer or add light"
         found = _pointer(picture, *circle)
-        return (
-            [_hand(picture, circle, *found)] if found else "no pointer stands out on the dial: come closer or add light"
-        )
+        if found is None:
+            return "no pointer stands out on the dial: come closer or add light"
+        if red is None or not is_red(picture, found[0], *circle):
+            return [_hand(picture, circle, *found)]
+        in_red = found[0]
     red_hand = _hand(picture, circle, in_red, confidence_of(in_red), red)
     rest = without(picture, red, in_red, *circle)
-    found = _pointer(rest, *circle)
-    apart = found is not None and _apart(found[0], in_red) > TWO_RAD
-    if found is not None and apart and min(found[1], confidence_of(found[0])) >= SECOND:
-        black = _hand(rest, circle, *found)
+    other = _other(rest, in_red, *circle)
+    if other is not None and not is_red(picture, other, *circle) and confidence_of(other) >= SECOND:
+        black = _hand(rest, circle, other, confidence_of(other))
         return [red_hand, black] if asked == "red" else [black, red_hand]
     if asked == "black":
         return "no pointer but a red one stands out on the dial: come closer or add light"
@@ -85,8 +93,19 @@ def find_hands(picture: Image, circle: tuple[float, float, float], asked: Pointe
     alone = _pointer(picture, *circle)
     if alone is None:
         return [red_hand]
-    sure = _apart(alone[0], in_red) < SAME_RAD and not (found is not None and apart and found[1] > 1.0 - SURE)
-    return [_hand(picture, circle, alone[0], alone[1] if sure else min(alone[1], ONE_OF_TWO), red)]
+    return [_hand(picture, circle, *alone, red)]
+
+
+def _other(rest: Image, red: PointerFit, u: float, v: float, radius: float) -> PointerFit | None:
+    """Return the line beside a red pointer, in the lightness of the picture without that; None if there is none.
+
+    What lies on the red pointer's own axis may be its other end.
+    """
+    fits, _ = _lines(as_gray(rest), u, v, radius)
+    best = max(fits, key=_clearness, default=None)
+    if best is None or min(_apart(best, red), _apart(best, replace(red, angle_rad=red.angle_rad + np.pi))) < TWO_RAD:
+        return None
+    return best
 
 
 def _hand(
@@ -101,8 +120,9 @@ def _hand(
     face = float(np.median(gray[np.hypot(right, up) < 0.8 * circle[2]]))
     along = right * np.sin(fit.angle_rad) + up * np.cos(fit.angle_rad)
     across = np.abs(right * np.cos(fit.angle_rad) - up * np.sin(fit.angle_rad))
-    own = gray[(across < 1.0) & (along > 0.25 * circle[2]) & (along < 0.55 * circle[2])]
-    is_dark = own.size == 0 or float(np.median(own)) <= face
+    own = gray[(across < STRIP[-1] * circle[2]) & (along > 0.25 * circle[2]) & (along < 0.55 * circle[2])]
+    low, high = np.percentile(own, [5, 95])
+    is_dark = bool(face - low >= high - face)
     ink = _coded(face - gray if is_dark else gray - face)
     colour = "black" if is_dark else "white"
     return Hand(fit=fit, most=most, colour=colour, length=length_of(ink, fit.angle_rad, *circle))
@@ -121,8 +141,8 @@ def _pointer(picture: Image, u: float, v: float, radius: float) -> tuple[Pointer
     in_gray, in_colour = _lines(picture, u, v, radius)
     fit, most = None, 0.0
     if in_gray or in_colour:
-        fit, rival = _believed(in_gray, in_colour)
-        most = min(confidence_of(fit), _agreement(fit, rival))
+        fit, most, rival = _believed(in_gray, in_colour)
+        most = min(most, confidence_of(fit), _agreement(fit, rival))
     elsewhere = by_sides is not None and (fit is None or _apart(fit, by_sides.fit) > OTHER_RAD)
     if by_sides is not None and elsewhere and by_sides.most > min(most, SURE):
         return by_sides.fit, by_sides.most if most < SURE else CONTRADICTED
@@ -138,35 +158,61 @@ def _lines(picture: Image, u: float, v: float, radius: float) -> tuple[list[Poin
     fits: list[list[PointerFit]] = []
     y, x = np.mgrid[: gray.shape[0], : gray.shape[1]]
     disc = np.hypot(x - u, y - v) < radius
+    face = float(np.median(gray[disc]))
     for channel, least in _channels(picture, gray, disc):
         patch = patch_about(channel, u, v)
         fits.append([])
         for dark in (True, False):
-            search = PointerSearch(
-                pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
-                fine_m=(0.35 * radius, 0.78 * radius), width_rad=float(np.deg2rad(50.0)), quantile=0.4, dark=dark,
-                pivot_sigma_px=0.02 * radius,
-            )  # fmt: skip
-            fit = find_pointer(patch, search, cover=glare)
-            if fit is None or fit.contrast < least:
-                continue
-            if _reaches_hub(patch, fit.angle_rad, radius) >= LEAST_CONNECTED:
+            fit = _from_hub(patch, radius, glare, dark=dark)
+            if fit is not None and fit.contrast >= (TIMES_FACE * face if channel is gray and not dark else least):
                 fits[-1].append(fit)
     return fits[0], [fit for of_channel in fits[1:] for fit in of_channel]
 
 
-def _believed(in_gray: list[PointerFit], in_colour: list[PointerFit]) -> tuple[PointerFit, PointerFit | None]:
-    """Return the pointer to be read, and the clearest one in another direction.
+def _from_hub(patch: Patch, radius: float, glare: NDArray[np.bool_] | None, *, dark: bool) -> PointerFit | None:
+    """Return the clearest pointer of one polarity that comes from the hub; None if none stands out.
 
-    Lightness is sharper than colour, so its direction is used if it shows the clearest pointer well.
+    Numerals and words do not come from the hub. They are covered, so that they are no rivals either.
+    """
+    search = PointerSearch(
+        pivot_m=(0.0, 0.0), inner_m=NUMERALS_FROM * radius, outer_m=TIP_AT * radius,
+        fine_m=(0.35 * radius, 0.78 * radius), width_rad=float(np.deg2rad(50.0)), quantile=0.4, dark=dark,
+        pivot_sigma_px=0.02 * radius,
+    )  # fmt: skip
+    y, x = np.mgrid[: patch.gray.shape[0], : patch.gray.shape[1]]
+    turn = np.arctan2(x - patch.origin_px[0], patch.origin_px[1] - y)
+    cover, connected = glare, None
+    for _ in range(MOST_COVERED):
+        fit = find_pointer(patch, search, cover=cover)
+        if fit is None:
+            break
+        if _reaches_hub(patch, fit, radius) < LEAST_CONNECTED:
+            other = fit.angle_rad
+        else:
+            connected, other = fit, fit.rival_rad
+            rival = replace(fit, angle_rad=other)
+            if fit.rival_ratio < LEAST_RIVAL or _reaches_hub(patch, rival, radius) > RIVAL_CONNECTED:
+                break
+        sector = np.abs(wrapped(turn - other)) < NUMERAL_RAD
+        cover = sector if cover is None else cover | sector
+    return connected
+
+
+def _believed(in_gray: list[PointerFit], in_colour: list[PointerFit]) -> tuple[PointerFit, float, PointerFit | None]:
+    """Return the pointer to be read, the largest confidence of its direction, and the clearest one in another direction.
+
+    Lightness is sharper than colour, so its direction is used if it shows the clearest pointer, too; a direction that
+    only colour shows is never sure.
     """
     fits = in_gray + in_colour
-    best, same_rad = max(fits, key=_clearness), SAME_RAD
+    best, same_rad, most = max(fits, key=_clearness), SAME_RAD, 1.0
     well = [fit for fit in in_gray if _apart(fit, best) < COLOUR_OFF_RAD and confidence_of(fit) > SHOWN_WELL]
     if well:
         best, same_rad = max(well, key=_clearness), COLOUR_OFF_RAD
+    elif best not in in_gray:
+        most = ONLY_IN_COLOUR
     others = [fit for fit in fits if _apart(fit, best) > same_rad]
-    return best, max(others, key=_clearness, default=None)
+    return best, most, max(others, key=_clearness, default=None)
 
 
 def _agreement(best: PointerFit, rival: PointerFit | None) -> float:
@@ -210,23 +256,22 @@ def _glare(gray: Image, u: float, v: float, radius: float) -> NDArray[np.bool_] 
     return with_halo(np.isin(labels, spots), radius)
 
 
-def _reaches_hub(patch: Patch, angle_rad: float, radius: float) -> float:
-    """Return the share of the way from hub to numerals that resembles the outer pointer rather than the face."""
-    turn = np.linspace(-np.pi, np.pi, 180)
-    outer = np.linspace(NUMERALS_FROM, TIP_AT, 12) * radius
-    inner = np.linspace(0.15, NUMERALS_FROM, 12) * radius
-    face = np.median(unroll(patch, (0.0, 0.0), outer, turn), axis=1)
-    beside = angle_rad + np.deg2rad(np.array([-2.0, 0.0, 2.0]))
-    pointer = unroll(patch, (0.0, 0.0), outer, beside).mean(axis=1)
-    contrast = float(np.median(pointer - face))
-    if contrast == 0:
-        return 0.0
-    # The pivot may be off the dial's middle, so a strip of that width is searched.
-    off = np.linspace(-PIVOT_OFF, PIVOT_OFF, 9) * radius
-    x = inner[:, None] * np.sin(angle_rad) + off * np.cos(angle_rad)
-    y = inner[:, None] * np.cos(angle_rad) - off * np.sin(angle_rad)
-    way = (patch.sample(x, y) - float(np.median(face))) / contrast
-    return float((way.max(axis=1) > 0.5).mean())
+def _reaches_hub(patch: Patch, fit: PointerFit, radius: float) -> float:
+    """Return the share of the way from hub to numerals that resembles the outer pointer rather than the face beside it.
+
+    The pivot may be off the dial's middle, so the pointer is looked for in a strip of that width.
+    """
+    sin, cos, sign = np.sin(fit.angle_rad), np.cos(fit.angle_rad), -1.0 if fit.is_dark else 1.0
+
+    def ink(first: float, last: float) -> Array:
+        r = np.linspace(first, last, 12)[:, None] * radius
+        strip, beside = (
+            patch.sample(r * sin + off * radius * cos, r * cos - off * radius * sin) for off in (STRIP, BESIDE)
+        )
+        return np.asarray((sign * strip).max(axis=1) - np.median(sign * beside, axis=1))
+
+    least = 0.5 * float(np.median(ink(NUMERALS_FROM, TIP_AT)))
+    return float((ink(HUB_TO, NUMERALS_FROM) > least).mean()) if least > 0.0 else 0.0
 
 
 def _channels(image: Image, gray: Image, disc: NDArray[np.bool_]) -> list[tuple[Image, float]]:

@@ -20,7 +20,10 @@ WIDE_RAD = np.deg2rad(24.0)  # anything wider than this is no pointer
 HALF_OF_RED = 0.4  # share of a pointer's own redness from which a pixel belongs to it
 BESIDE_RAD = np.deg2rad(10.0)  # a pointer's pixels are within this of its direction
 BESIDE = 0.13  # of the radius, or within this of its axis, as a counterweight is
-LEAST_SUPPORTED, LEAST_STRENGTH, MOST_RIVAL = 0.7, 60.0, 0.5
+LEAST_SUPPORTED, LEAST_STRENGTH, MOST_RIVAL = 0.6, 40.0, 0.5
+ACROSS, FACE_BESIDE = np.linspace(-0.08, 0.08, 17), np.linspace(0.12, 0.2, 9)  # of the radius, across a pointer
+BEYOND_TAIL = (0.42, 0.6)  # of the radius: beyond the other end of another pointer, and within every red one
+LEAST_LACKING, RED_LACKS = 0.02, 0.75  # green that a pointer takes from the strip, and red that a red one lacks at most
 LENGTHS = np.linspace(0.3, 1.0, 36)  # shares of the radius
 LIGHT_RAD = np.deg2rad(6.0)  # lightness is searched for the pointer's sharper edge within this
 
@@ -63,6 +66,24 @@ def find_red_pointer(red: NDArray[np.float32], u: float, v: float, radius: float
     if fit is None or fit.contrast * most / 200.0 < LEAST_CONTRAST or fit.supported < LEAST_SUPPORTED:
         return None
     return fit if fit.rival_ratio < MOST_RIVAL and fit.strength > LEAST_STRENGTH else None
+
+
+def is_red(picture: Image, fit: PointerFit, u: float, v: float, radius: float) -> bool:
+    """Return whether a pointer lacks green of the face's light much more than it lacks red.
+
+    The ratio does not change with light, blur and width, unlike a colour. A black pointer lacks both alike.
+    """
+    away = np.linspace(*BEYOND_TAIL, 24)[:, None] * radius
+
+    def mean(off: NDArray[np.float64]) -> NDArray[np.float64]:
+        x = u + away * np.sin(fit.angle_rad) + off * radius * np.cos(fit.angle_rad)
+        y = v - away * np.cos(fit.angle_rad) + off * radius * np.sin(fit.angle_rad)
+        seen = cv2.remap(picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+        return np.asarray(np.median(seen.astype(float).mean(axis=1), axis=0))
+
+    face = 0.5 * (mean(FACE_BESIDE) + mean(-FACE_BESIDE)) + 1.0
+    lacking = 1.0 - mean(ACROSS) / face
+    return bool(lacking[1] > LEAST_LACKING and lacking[0] < RED_LACKS * lacking[1])
 
 
 def without(picture: Image, red: NDArray[np.float32], fit: PointerFit, u: float, v: float, radius: float) -> Image:

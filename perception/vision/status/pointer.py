@@ -26,6 +26,7 @@ REFINE_RAD = float(np.deg2rad(7.0))  # half width of the search when the angle i
 ROUGH_SIGMA_RAD = float(np.deg2rad(3.0))  # standard deviation of a pointer whose axis cannot be fitted
 # Half width of the area whose median is the face; pointer and numerals cover less than half of it.
 ABOUT_RAD = float(np.deg2rad(60.0))
+GAP = 0.35  # of what seems a pointer's ink; a gap between two bright things has less
 LEAST_OFF_FACE = 0.7  # of a pointer's ink; 99 % of 250 pointers read correctly have more than 0.82
 #: Share of the radii next to the hub, and largest ratio of a pointer's ink at all radii to its ink there. For the
 #: pointers of 340 gauges the ratio is at most 1.6, for numerals and words that were taken for one at least 2.5.
@@ -123,9 +124,11 @@ def find_pointer(patch: Patch, search: PointerSearch, *, cover: NDArray[np.bool_
             found.append((fit, ink))
     if not found:
         return None
-    if len(found) > 1 and wraps:
-        no_gap = [(fit, ink) for fit, ink in found if _off_face(fit, polar[rows], ink[rows], angles) > LEAST_OFF_FACE]
-        found = no_gap or found
+    if wraps:
+        off_face = [_off_face(fit, polar[rows], ink[rows], angles) for fit, ink in found]
+        if max(off_face) < GAP:
+            return None
+        found = [pointer for pointer, off in zip(found, off_face, strict=True) if off > LEAST_OFF_FACE] or found
     fit, ink = max(found, key=lambda pointer: _clarity(pointer[0]))
     offset = wrapped(angles - fit.angle_rad) if wraps else angles - fit.angle_rad
     fine = (radii >= search.fine_m[0]) & (radii <= search.fine_m[1])

@@ -8,13 +8,14 @@ import pytest
 
 from benchmarks.vision_dials import draw_dial
 from benchmarks.vision_manometers import UNUSUAL, USUAL, Way, draw_manometer
+from hal.arrays import Image
 from perception.vision import read_photograph
-from perception.vision.photographs.dial import BY_TICKS
+from perception.vision.photographs.dial import BY_TICKS, NARROW, NARROW_RAD, RED_UNASKED
 from perception.vision.photographs.hands import Pointer, find_hands
 
 TWO = Way(has_red=True)
 SCALE, ENDS = (0.0, 10.0), (TWO.angle_rad(0.0), TWO.angle_rad(1.0))
-SEEDS = range(200001, 200007)
+SEEDS = range(200000, 200006)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -88,3 +89,50 @@ def test_ends_that_no_tick_confirms_are_not_sure() -> None:
     assert told.confidence <= BY_TICKS
     sure = read_photograph(picture, "gauge", scale=SCALE, ends_rad=ENDS)
     assert sure.confidence > BY_TICKS
+
+
+def test_a_bright_gap_beside_a_pointer_is_not_read() -> None:
+    """In this drawing the gap between a pointer and a shadow was read surely, 2 % of the scale away."""
+    drawn = draw_manometer(200000, TWO)
+    told = read_photograph(drawn.image, "gauge", scale=SCALE, ends_rad=ENDS, pointer="black")
+    assert told.value == pytest.approx(drawn.reading, abs=0.25)
+
+
+@pytest.mark.parametrize("seed", [910002, 310102, 320191])
+def test_a_red_pointer_is_never_read_for_a_black_one(seed: int) -> None:
+    """In these drawings the red pointer is so thin or so lit that the search in redness alone misses it."""
+    drawn = draw_manometer(seed, TWO)
+    told = read_photograph(drawn.image, "gauge", scale=SCALE, ends_rad=ENDS, pointer="black")
+    assert told.value is None or told.value == pytest.approx(drawn.reading, abs=0.25)
+
+
+def test_a_red_pointer_that_nobody_asked_for_is_not_sure() -> None:
+    picture = _face_with_line((200, 30, 30))
+    assert read_photograph(picture, "gauge", scale=SCALE, ends_rad=ENDS, least_confidence=0.0).confidence <= RED_UNASKED
+    asked = read_photograph(picture, "gauge", scale=SCALE, ends_rad=ENDS, pointer="red")
+    black = read_photograph(_face_with_line((20, 20, 20)), "gauge", scale=SCALE, ends_rad=ENDS)
+    assert asked.confidence > RED_UNASKED and black.confidence > RED_UNASKED
+
+
+def test_a_reading_on_a_narrow_scale_is_not_sure() -> None:
+    half = 0.49 * NARROW_RAD
+    picture = _face_with_line((20, 20, 20), angle_rad=0.2)
+    narrow = read_photograph(picture, "gauge", scale=SCALE, ends_rad=(-half, half), least_confidence=0.0)
+    wide = read_photograph(picture, "gauge", scale=SCALE, ends_rad=(-2 * half, 2 * half))
+    assert narrow.confidence <= NARROW < wide.confidence
+
+
+@pytest.mark.parametrize("seed", [310005, 310071])
+def test_a_pointer_off_the_middle_or_in_a_reflection_still_comes_from_the_hub(seed: int) -> None:
+    drawn = draw_manometer(seed, USUAL)
+    told = read_photograph(drawn.image, "gauge", scale=SCALE, ends_rad=ENDS)
+    assert told.value == pytest.approx(drawn.reading, abs=0.25)
+
+
+def _face_with_line(colour: tuple[int, int, int], angle_rad: float = 1.0) -> Image:
+    """Draw a white face with a rim and one pointer."""
+    picture = np.full((220, 220, 3), 235, np.uint8)
+    cv2.circle(picture, (110, 110), 104, (40, 40, 40), 4, cv2.LINE_AA)
+    tip = (round(110 + 85 * np.sin(angle_rad)), round(110 - 85 * np.cos(angle_rad)))
+    cv2.line(picture, (110, 110), tip, colour, 4, cv2.LINE_AA)
+    return picture

@@ -187,7 +187,7 @@ def test_the_example_of_a_plate_is_in_metres() -> None:
 def test_nothing_is_called_ready_that_ends_already(monkeypatch: pytest.MonkeyPatch, served: Panelwright) -> None:
     monkeypatch.setattr(Panelwright, "is_ending", property(lambda _self: True))
     with serving.console.capture() as seen:
-        serving._announce(served, wants_console=False)
+        serving._announce(served)
     assert seen.get() == ""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hal.errors import CellError, DeviceFault, MotionError, Stopped
-from hal.motion import Hold, MotionOutcome
+from hal.motion import NO_LIMITS, Hold, MotionOutcome
 from service.operations.session import Session
 
 
@@ -18,7 +18,7 @@ def failure(outcome: MotionOutcome, cause: str, **more: str) -> CellError:
     vars(report).update(more)
     mover: Any = SimpleNamespace(execute=lambda _: report)
     context: Any = SimpleNamespace(
-        task=SimpleNamespace(check_cancelled=lambda: None), connection=SimpleNamespace(mover=mover)
+        task=SimpleNamespace(check_cancelled=lambda: None), connection=SimpleNamespace(mover=mover), limits=NO_LIMITS
     )
     with pytest.raises(CellError) as raised:
         Session(context=context).run(Hold(name="to park", duration_s=1.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ def install(place: Place) -> None:
             if mirror.may(Role.OPERATOR):
                 button(say("cell.scan"), lambda: _show_points(mirror, drawn), look="plain")
             for line in (_pose_line, _force_line, _plan_line):
-                live(ui.html("", sanitize=False, tag="p"), lambda line=line: line(mirror))  # type: ignore[misc]
+                live(ui.html("", sanitize=False, tag="p"), partial(line, mirror))
             ui.html(say("cell.legend"), sanitize=False, tag="p").classes("quiet")
 
 

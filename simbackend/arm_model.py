@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from hal.devices import ArmCapabilities, DhLink
+from hal.geometry import identity, product, transform_rpy
 from simbackend.tool_model import tool_urdf
 from simbackend.urdf import Colour, along, cylinder, inertial, joint, link, shape, sphere
 
@@ -132,16 +133,16 @@ def _capabilities(
 
 def base_from_flange(links: tuple[DhLink, ...], position_rad: np.ndarray) -> RigidTransform:
     """Return base_from_flange as the product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) over the joints."""
-    pose = RigidTransform.identity()
+    pose = identity()
     for dh, q in zip(links, position_rad, strict=True):
-        turn = RigidTransform.from_rotation(Rotation.from_euler("z", q + dh.offset_rad))
-        pose = pose * turn * link_from_next(dh)
+        turn = transform_rpy((0.0, 0.0, 0.0), (0.0, 0.0, q + dh.offset_rad))
+        pose = product(pose, product(turn, link_from_next(dh)))
     return pose
 
 
 def link_from_next(dh: DhLink) -> RigidTransform:
     """Return the fixed part of a standard DH link: Tz(d) Tx(a) Rx(alpha)."""
-    return RigidTransform.from_components([dh.a_m, 0.0, dh.d_m], Rotation.from_euler("x", dh.alpha_rad))
+    return transform_rpy((dh.a_m, 0.0, dh.d_m), (dh.alpha_rad, 0.0, 0.0))
 
 
 def arm_urdf(
@@ -156,7 +157,7 @@ def arm_urdf(
     lines = ['<robot name="arm">', *link("base", inertial(10.0, (0, 0, 0), (1.0, 1.0, 1.0)))]
     parent, parent_from_joint = "base", RigidTransform.identity()
     for i, dh in enumerate(caps.links):
-        turn = RigidTransform.from_rotation(Rotation.from_euler("z", dh.offset_rad))
+        turn = transform_rpy((0.0, 0.0, 0.0), (0.0, 0.0, dh.offset_rad))
         name = f"link{i + 1}"
         lines += _link(
             name, model.mass_kg[i], (dh.a_m, 0.0, dh.d_m), caps.link_radius_m[i], PAINT[i % 2], is_foot=i == 0

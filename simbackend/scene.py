@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
+from hal.geometry import matrix_of
 from simbackend import meshes
 from simbackend.canvas import Pixels
 from simbackend.meshes import Mesh
@@ -64,7 +65,7 @@ class Scene:
     ) -> None:
         """Add a printed face that never moves."""
         mesh = meshes.flat(size_m, is_round=is_round)
-        turn = np.asarray(base_from_picture.rotation.as_matrix())
+        turn = matrix_of(base_from_picture)
         self._pictures.append(pixels)
         self._add(-1, -1, meshes.placed(mesh, turn, base_from_picture.translation), np.ones(3), len(self._pictures) - 1)
 
@@ -117,7 +118,7 @@ class Scene:
 
     def shift_prints(self, moved: RigidTransform) -> None:
         """Move all printed faces by a displacement in the base frame."""
-        turn = np.asarray(moved.rotation.as_matrix())
+        turn = matrix_of(moved)
         for part in self._parts:
             if part.body < 0:
                 self._points[part.rows] = self._points[part.rows] @ turn.T + moved.translation
@@ -147,7 +148,7 @@ class Scene:
         `channels`: 3 for RGB, 1 for grey, 0 for depth alone.
         """
         self._follow()
-        seen = (self._points - base_from_camera.translation) @ np.asarray(base_from_camera.rotation.as_matrix())
+        seen = (self._points - base_from_camera.translation) @ matrix_of(base_from_camera)
         attributes = np.concatenate([self._shade[:, :, None], self._mesh.uv], axis=2)
         compiled = self._compiled[channels]
         inverse_depth = np.zeros((height, width), np.float32)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.arrays import Array
 from hal.devices import ArmCapabilities
 from hal.errors import ConfigError, Unreachable
+from hal.geometry import orthonormal, product
 from manipulation.arm import branches, kernels
 from manipulation.arm.branches import whole_turns
 
@@ -82,11 +83,11 @@ class Kinematics:
 
     def flange(self, q_rad: Array) -> RigidTransform:
         """Return `base_from_flange` for joints (n,) rad."""
-        return RigidTransform.from_matrix(kernels.frames(self.dh, q_rad)[-1])
+        return orthonormal(kernels.frames(self.dh, q_rad)[-1])
 
     def tool(self, q_rad: Array, flange_from_tool: RigidTransform) -> RigidTransform:
         """Return `base_from_tool` for joints (n,) rad."""
-        return self.flange(q_rad) * flange_from_tool
+        return product(self.flange(q_rad), flange_from_tool)
 
     def jacobian(self, q_rad: Array, flange_from_tool: RigidTransform) -> Array:
         """Return the (6, n) Jacobian of the tool's origin in base axes: velocity, then angular velocity."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.geometry import identity
+from hal.geometry import identity, orthonormal
 from hal.motion import ContactForce, DeclaredMotion, MotionLog, MotionReport
 from manipulation.control.sensing import Sample, ToolReading
 from manipulation.control.termination import Termination
@@ -96,7 +95,7 @@ class Recorder:
             started_s=span_s[0],
             ended_s=span_s[1],
             position_rad=np.zeros(joints) if sample is None else sample.position_rad,
-            base_from_tool=identity() if look is None else RigidTransform.from_matrix(look.base_from_tool),
+            base_from_tool=identity() if look is None else orthonormal(look.base_from_tool),
             wrench=np.zeros(6) if look is None else look.wrench,
             peak_force_n=self.peak_force_n,
             gripper_width_m=None if sample is None else sample.gripper_width_m,

@@ -16,6 +16,7 @@ from hal.calibration import ToolLoad
 from hal.clock import Clock, Deadline, PacedClock, SimClock
 from hal.devices import Arm, ForceTorque, Gripper, JointState, Proximity, Touch
 from hal.errors import CellError, DeviceError, DeviceTimeout, StaleReading
+from hal.geometry import orthonormal
 from hal.motion import RobotState
 from hal.readings import Cause, Quality, Stamped
 from manipulation.arm.kernels import frames
@@ -318,7 +319,7 @@ def state_of(
         stamp_s=sample.stamp_s,
         position_rad=sample.position_rad,
         velocity_rad_per_s=sample.velocity_rad_per_s,
-        base_from_flange=RigidTransform.from_matrix(flange),
+        base_from_flange=orthonormal(flange),
         wrench=contact.in_flange(sample.raw_wrench, flange) if sample.is_felt else np.zeros(6),
         contacts=sample.contacts,
         proximity_m=sample.proximity_m,

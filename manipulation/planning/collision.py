@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
+from hal.geometry import matrix_of
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning import clearance
 from manipulation.planning.shapes import Capsule, CollisionBox
@@ -80,7 +81,7 @@ class CollisionModel:
             self,
             boxes=boxes,
             watched=watched,
-            rotations=np.array([p.rotation.as_matrix() for p in poses]).reshape(-1, 3, 3),
+            rotations=np.array([matrix_of(p) for p in poses]).reshape(-1, 3, 3),
             middles=np.array([p.translation for p in poses]).reshape(-1, 3),
             halves=np.array([box.half_m for box in boxes]).reshape(-1, 3),
         )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from scipy.spatial.transform import RigidTransform
 
-from hal.geometry import identity, transform_rpy
+from hal.geometry import product, transform_rpy
 from hal.panel import Panel, PanelObject, Shown
 
 Vector3 = tuple[float, float, float]
@@ -43,7 +43,7 @@ class CollisionBox:
     def moved(self, grand_from_parent: RigidTransform) -> CollisionBox:
         """Return the same box seen from the parent's parent."""
         return CollisionBox(
-            name=self.name, parent_from_box=grand_from_parent * self.parent_from_box, half_m=self.half_m
+            name=self.name, parent_from_box=product(grand_from_parent, self.parent_from_box), half_m=self.half_m
         )
 
 
@@ -69,7 +69,7 @@ def envelope(panel_object: PanelObject, shown: Shown | None = None) -> Collision
     foot = transform_rpy((*panel_object.position_m, 0.0), (0.0, 0.0, room.turn_rad))
     return CollisionBox(
         name=panel_object.name,
-        parent_from_box=foot * transform_rpy((*room.middle_m, room.height_m / 2), (0.0, 0.0, 0.0)),
+        parent_from_box=product(foot, transform_rpy((*room.middle_m, room.height_m / 2), (0.0, 0.0, 0.0))),
         half_m=(*room.half_m, room.height_m / 2),
     )
 
@@ -78,6 +78,6 @@ def floor_box(z_m: float) -> CollisionBox:
     """Return the floor as a box whose top lies at `z_m` of the base; the caller must exempt the arm's own foot."""
     return CollisionBox(
         name="floor",
-        parent_from_box=identity() * transform_rpy((0.0, 0.0, z_m - 0.5), (0.0, 0.0, 0.0)),
+        parent_from_box=transform_rpy((0.0, 0.0, z_m - 0.5), (0.0, 0.0, 0.0)),
         half_m=(3.0, 3.0, 0.5),
     )

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
+from hal.geometry import matrix_of
 from hal.motion import Guard, Hold, MotionReport, Quantity
 from manipulation.planning.cartesian_path import shifted
 from manipulation.skills.attempt import RETREAT_M_PER_S, Attempt
@@ -89,7 +90,7 @@ def contact_of(report: MotionReport, *, finger_half_m: tuple[float, float]) -> T
     surface, _ = onset(depth, force, float(report.base_from_tool.translation @ axis))
     tip = report.base_from_tool.translation
     point = tip + (surface - tip @ axis) * axis
-    R = report.base_from_tool.rotation.as_matrix()
+    R = matrix_of(report.base_from_tool)
     half_x, half_y = finger_half_m
     # The contact is anywhere on the rectangular face with equal probability: the variance is half^2 / 3.
     local = np.diag([half_x**2 / 3, half_y**2 / 3, NORMAL_SIGMA_M**2])

@@ -16,6 +16,7 @@ from hal.geometry import (
     interpolate,
     perturbed,
     point_covariance,
+    product,
     skew,
     to_json,
     transform_rpy,
@@ -103,3 +104,8 @@ def test_roll_pitch_and_yaw_turn_about_the_parents_axes_in_that_order() -> None:
     pose = transform_rpy((1.0, 2.0, 3.0), (roll, pitch, yaw))
     np.testing.assert_allclose(pose.rotation.as_matrix(), expected.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(pose.translation, (1.0, 2.0, 3.0))
+
+
+@given(poses, poses)
+def test_a_product_without_normalising_is_the_product(a: RigidTransform, b: RigidTransform) -> None:
+    np.testing.assert_allclose(product(a, b).as_matrix(), (a * b).as_matrix(), atol=1e-12)

@@ -181,9 +181,9 @@ def _probed(panelwright: Panelwright, missions: int) -> tuple[list[float], list[
             plant.history.add([one])
             for listen in plant.observations.listeners:
                 listen([one])
-            newest = reader.page(plant.history.ask(object="probe"), after=reader.newest_id() - 20, limit=20)
+            newest = reader.last(plant.history.ask(object="probe"), limit=1)
             stored.append(time.monotonic() - begun[-1])
-            if not any(row.reading.value == float(number) for row in newest):
+            if newest[0].reading.value != float(number):
                 raise AssertionError(f"reading {number} is not visible after it was stored")
             pause.wait(PROBE_S)
         if task.problem is not None:

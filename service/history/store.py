@@ -24,7 +24,8 @@ TRIM_EVERY_S = 3600.0  # between two looks at the age of the oldest reading
 TRIM_EVERY_ADDS = 100  # between two looks at the size
 TRIM_SHARE = 0.1  # of the readings leave at once when the file is too large
 ALL = ("id", "cell", "panel", *COLUMNS)
-INSERT = f"INSERT INTO readings (cell, panel, {', '.join(COLUMNS)}) VALUES ({', '.join('?' * (2 + len(COLUMNS)))})"
+ROW = f"({', '.join('?' * (2 + len(COLUMNS)))})"
+INSERT = f"INSERT INTO readings (cell, panel, {', '.join(COLUMNS)}) VALUES "
 log = logging.getLogger(__name__)
 
 
@@ -182,14 +183,9 @@ class History:
             log.error("the history is larger than it should be: %s", error.what)
 
     def _insert(self, rows: Sequence[tuple[object, ...]]) -> None:
-        try:
-            self._db.execute("BEGIN IMMEDIATE")
-            self._db.executemany(INSERT, rows)
-            self._db.execute("COMMIT")
-        except sqlite3.Error:
-            with suppress(sqlite3.Error):
-                self._db.execute("ROLLBACK")
-            raise
+        # One statement for all rows, which is a transaction of its own: each further call of SQLite may wait for the
+        # lock of Python.
+        self._db.execute(INSERT + ", ".join([ROW] * len(rows)), [value for row in rows for value in row])
 
     def _begin_anew(self) -> None:
         """Set the damaged file aside and begin a new one."""

@@ -151,7 +151,8 @@ def _turn_on(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Be
     if hold is None:
         raise _given_up(belief, begun_rad)
     try:
-        _turn_once(attempt, wheel, where, belief, hold, target_rad - begun_rad)
+        span_rad = target_rad - begun_rad
+        _turn_once(attempt, wheel, where, belief, hold, span_rad + np.sign(span_rad) * belief.lost_rad)
     except Unreachable:
         belief.failed.add(hold)
         if belief.next_hold(wheel, hand) is None:
@@ -212,12 +213,12 @@ def _turn_once(
     turn.free_rad = free_turn_rad(wheel, where, sign)
     try:
         turn.turn(part_rad)
-        _note(where, turn, sign)
+        _note(where, turn, sign, belief.lost_rad)
         belief.felt(turn.felt_nm)
         belief.effort_nm = turn.felt_nm
         belief.turned(hold, angle_rad, where.known)
     except SkillFailure as failure:
-        _note(where, turn, sign)
+        _note(where, turn, sign, belief.lost_rad)
         where.moved_to(at_a_stop(wheel, where.known, sign, failure.outcome))
         belief.felt(turn.felt_nm)
         belief.effort_nm = max(belief.effort_nm, turn.felt_nm)
@@ -230,10 +231,10 @@ def _turn_once(
         turn.let_go()
 
 
-def _note(where: InitialState, turn: WheelTurn, sign: float) -> None:
+def _note(where: InitialState, turn: WheelTurn, sign: float, lost_rad: float) -> None:
     """Keep how far the wheel has turned, and that it cannot have turned further than the hand."""
     ends = (-sign * DRAGGED_RAD, sign * turn.hand_rad)
-    where.moved_by(sign * turn.moved_rad, least=min(ends), largest=max(ends))
+    where.moved_by(sign * max(0.0, turn.moved_rad - lost_rad), least=min(ends), largest=max(ends))
 
 
 def free_turn_rad(wheel: Handwheel, where: InitialState, sign: float) -> float:

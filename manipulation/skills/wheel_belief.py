@@ -17,6 +17,7 @@ SIDE_N = 54.0  # of the hand on the rim; where the pads slip, the finger beside 
 SPARE_M = 0.001
 LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand
 SLACK_RAD = 0.03
+MOST_LOST_RAD = 0.15  # what pads, fingers and arm yield under the torque of a heavy wheel
 POOR_FRICTION = 0.3  # of pads on paint, with which the first grip across a wheel reckons
 SPARE_GRIP = 1.3
 FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
@@ -41,12 +42,14 @@ class Belief:
         failed: holds that were tried in vain.
         grip_n: force of the pads across the wheel; None until the first such hold.
         tried_nm: largest torque that was put on the wheel.
+        lost_rad: by how much less the wheel turns in a hold than is felt, because it springs back when it is let go.
     """
 
     effort_nm: float
     failed: set[Hold] = field(default_factory=set)
     grip_n: float | None = None
     tried_nm: float = 0.0
+    lost_rad: float = 0.0
     _first_rad: float | None = None
     _last: tuple[Hold, float, float] | None = None
 
@@ -91,6 +94,7 @@ class Belief:
         (hold, begun_rad, expected_rad), self._last = self._last, None
         felt_rad, moved_rad = abs(expected_rad - begun_rad), abs(seen_rad - begun_rad)
         if moved_rad >= LEAST_SHARE * felt_rad - SLACK_RAD:
+            self.lost_rad = float(np.clip(self.lost_rad + felt_rad - moved_rad, 0.0, MOST_LOST_RAD))
             return 0.0
         self.slipped(hold)
         return felt_rad - moved_rad

@@ -59,6 +59,16 @@ def test_a_wheel_that_followed_at_least_half_way_has_not_slipped(seen_rad: float
     assert not belief.failed
 
 
+def test_what_springs_back_when_the_wheel_is_let_go_is_added_to_the_next_turn() -> None:
+    belief = Belief(effort_nm=2.0)
+    belief.turned(Hold.ACROSS, 1.15, 1.97)
+    belief.learn(1.87)
+    assert belief.lost_rad == pytest.approx(0.1)
+    belief.turned(Hold.ACROSS, 1.87, 1.97)  # by what was felt, less what is lost
+    belief.learn(2.0)
+    assert belief.lost_rad == pytest.approx(0.07)
+
+
 def test_what_was_not_turned_teaches_nothing() -> None:
     assert Belief(effort_nm=0.5).learn(3.0) == 0.0
 

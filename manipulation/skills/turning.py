@@ -17,6 +17,7 @@ WINDOW = 4  # steps over which a slope is taken
 FLAT_RATIO = 0.3  # of the steepest slope: below it the object moves
 LEAST_NM = 0.06  # above noise, drift and the hand's own inertia
 SLIP_RATIO = 0.5
+SLIDING_RATIO, STEEP_RATIO = 0.5, 0.5  # see `_breakaway`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,9 +94,19 @@ def _wound_up(grid: Array, level_nm: Array, gives: int, end_nm: float, slope: fl
 
 
 def _breakaway(level_nm: Array, slopes: Array) -> int | None:
-    """Return the index at which a rising torque (N,) becomes flat; None when it does not."""
+    """Return the index at which a rising torque (N,) becomes flat; None when it does not.
+
+    A torque that is flat and then rises steeply to a flat one of more than twice its size was a finger that slid, before
+    both pushed: the object gives way at the second.
+    """
+    found: int | None = None
     for k in range(1, len(slopes)):
         steepest = float(slopes[:k].max())
-        if level_nm[k] > LEAST_NM and steepest > 0.5 and slopes[k] < FLAT_RATIO * steepest:
-            return k
-    return None
+        is_flat = level_nm[k] > LEAST_NM and steepest > 0.5 and slopes[k] < FLAT_RATIO * steepest
+        if not is_flat:
+            continue
+        if found is None or (
+            level_nm[found] < SLIDING_RATIO * level_nm[k] and slopes[found:k].max() >= STEEP_RATIO * steepest
+        ):
+            found = k
+    return found

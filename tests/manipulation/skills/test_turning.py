@@ -30,6 +30,15 @@ def test_an_object_has_moved_by_the_turn_less_the_way_to_it_and_the_give_of_the_
     assert felt.moved_rad == pytest.approx(2.0 - FREE_RAD - friction_nm / pads_nm_per_rad, abs=0.05)
 
 
+def test_a_finger_that_slides_before_both_push_is_not_the_object_that_gives_way() -> None:
+    turned = np.linspace(0.0, 5.0, 1000)
+    sliding = np.clip(2.0 * (turned - 0.02), 0.0, 0.3)
+    torque = sliding + torques(turned, friction_nm=2.4, pads_nm_per_rad=9.0)
+    felt = felt_in(Felt(), turned, torque)
+    assert felt.running_nm == pytest.approx(2.7, rel=0.05)
+    assert felt.moved_rad == pytest.approx(5.0 - FREE_RAD - 2.4 / 9.0, abs=0.1)
+
+
 def test_an_object_that_only_loads_the_pads_has_not_moved() -> None:
     turned = np.linspace(0.0, 0.9, 300)
     felt = felt_in(Felt(), turned, torques(turned, friction_nm=9.0, pads_nm_per_rad=3.0))

@@ -30,8 +30,8 @@ from service.processes.stop_host import InlineStop, ProcessStop
 from service.recording.endpoint import Endpoint
 
 START_TIMEOUT_S = 400.0  # the first start compiles the control kernels, which takes minutes on a busy machine
-MAX_SHORT_LIVES = 3  # a cell that ends this often within SHORT_LIFE_S of its start stays down when it ends again
-SHORT_LIFE_S = 10.0
+PAUSES_S = (0.0, 0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)  # before a restart, by the number of short lives in a row
+SHORT_LIFE_S = 2.0  # a cell that ends so soon after it was ready will probably do so again
 GIVE_UP_S = 2.5  # a cell that was lost and has not ended is killed after this time
 NO_RECORDS = Records()
 log = logging.getLogger(__name__)
@@ -357,17 +357,11 @@ class Supervisor:
             self._bury(child)
             is_short = time.monotonic() - self._ready_at_s < SHORT_LIFE_S
             self._short_lives = self._short_lives + 1 if is_short else 0
-            if not self._comes_back():
-                return
+            self._start_again()
 
-    def _comes_back(self) -> bool:
-        """Start the cell, again when that fails; returns False when it stays down."""
-        while not self._is_closing.is_set():
-            if self._short_lives > MAX_SHORT_LIVES:
-                log.error(
-                    "the cell died %d times in a row soon after its start and is not restarted", self._short_lives
-                )
-                return False
+    def _start_again(self) -> None:
+        """Start the cell, as often as it takes, with longer and longer pauses."""
+        while not self._is_closing.wait(PAUSES_S[min(self._short_lives, len(PAUSES_S) - 1)]):
             self._restarts += 1
             try:
                 self._start_child()
@@ -378,8 +372,7 @@ class Supervisor:
                 self._report("cell-restart-failed", {"why": error.what})
             else:
                 self._lost_since_s, self._is_watched = None, True
-                return True
-        return False
+                return
 
     def _bury(self, child: Child) -> None:
         child.kill()  # also ends the process of its simulated world

@@ -128,7 +128,10 @@ def test_killing_the_cell_takes_its_world_along_and_latches_the_stop(write_cell:
         supervisor.close()
 
 
-def test_a_cell_that_keeps_dying_stays_down_after_three_restarts(write_cell: WriteCell) -> None:
+def test_a_cell_that_keeps_dying_is_started_again_each_time(
+    write_cell: WriteCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.processes.supervisor.PAUSES_S", (0.0, 0.0, 0.01))
     supervisor = Supervisor(load_cell(write_cell()))
     try:
         supervisor.start()
@@ -139,29 +142,26 @@ def test_a_cell_that_keeps_dying_stays_down_after_three_restarts(write_cell: Wri
             if supervisor.is_ready and pid not in killed:
                 os.kill(pid, signal.SIGKILL)
                 killed.add(pid)
-            return len(killed) == 4
+            return len(killed) == 5
 
         eventually(kill_the_next, timeout_s=60.0)
-        eventually(lambda: not supervisor.is_ready)
-        with pytest.raises(DeviceUnavailable, match="not running"):
-            eventually_raises(supervisor)
-        assert next(p for p in supervisor.processes() if p.name == "cell").restarts == 3
+        eventually(lambda: supervisor.is_ready and _pid(supervisor, "cell") not in killed)
+        assert next(p for p in supervisor.processes() if p.name == "cell").restarts == 5
+        assert supervisor.latch.is_set()
     finally:
         supervisor.close()
 
 
-def eventually_raises(supervisor: Supervisor) -> None:
-    """Read until the connection detects that the cell is down."""
-
-    def read() -> bool:
-        try:
-            supervisor.connection.device("panel_lights").health()
-        except DeviceUnavailable as error:
-            if "not running" in error.what:
-                raise
-        return False
-
-    eventually(read)
+def test_a_service_that_ends_does_not_wait_for_the_pause_before_a_restart(
+    write_cell: WriteCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.processes.supervisor.PAUSES_S", (600.0,))
+    supervisor = Supervisor(load_cell(write_cell()))
+    supervisor.start()
+    os.kill(_pid(supervisor, "cell"), signal.SIGKILL)
+    eventually(lambda: not supervisor.is_ready)
+    supervisor.close()
+    assert next(p for p in supervisor.processes() if p.name == "cell").restarts == 0
 
 
 def test_a_dead_stop_process_latches_and_comes_back(write_cell: WriteCell) -> None:

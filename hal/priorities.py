@@ -1,7 +1,9 @@
 """The table of what runs first where processors are busy; a process needs no privileges for it.
 
-Linux gives every thread turns. From version 6.12 on, a thread may ask for short turns: it gets no more time of a processor
-than before, but when it wakes it interrupts threads with longer turns instead of waiting until theirs are over.
+Linux may share the processors between sessions first, and then within each of them (`sched_autogroup_enabled`). The niceness
+of a process that leads a session is therefore given to the session, too. Linux gives every thread turns. From version 6.12
+on, a thread may ask for short turns: it gets no more time of a processor than before, but when it wakes it interrupts
+threads with longer turns instead of waiting until theirs are over.
 """
 
 from __future__ import annotations
@@ -12,9 +14,11 @@ import platform
 import struct
 from contextlib import suppress
 from enum import Enum
+from pathlib import Path
 
 # struct sched_attr of linux/sched/types.h: size, policy, flags, niceness, priority, runtime (ns), deadline, period
 ATTRIBUTES = struct.Struct("=IIQiIQQQ")
+SESSION = Path("/proc/self/autogroup")
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}  # numbers of the system call sched_setattr
 
 
@@ -37,6 +41,9 @@ def take_priority(priority: Priority) -> None:
         return  # a real-time class, which somebody chose, comes before all of this
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + more)
+    if more and os.getsid(0) == os.getpid():
+        with suppress(OSError):  # what a system without this, or without the privilege, says
+            SESSION.write_text(str(more))
     call = CALLS.get(platform.machine())
     if turn_s is None or call is None:
         return

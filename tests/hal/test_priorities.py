@@ -5,11 +5,13 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import subprocess
+import sys
 import threading
 
 import pytest
 
-from hal.priorities import ATTRIBUTES, CALLS, Priority, take_priority
+from hal.priorities import ATTRIBUTES, CALLS, SESSION, Priority, take_priority
 
 pytestmark = pytest.mark.skipif(platform.machine() not in CALLS, reason="the system call is not known here")
 
@@ -47,3 +49,20 @@ def test_a_client_is_nicer_than_its_parent() -> None:
     niceness = os.getpriority(os.PRIO_PROCESS, 0)
     assert in_a_thread(Priority.CLIENT)[0] == min(19, niceness + 5)
     assert os.getpriority(os.PRIO_PROCESS, 0) == niceness
+
+
+def test_a_process_that_leads_a_session_gives_it_its_niceness_and_another_does_not() -> None:
+    program = "from hal.priorities import *; take_priority(Priority.CLIENT); print(SESSION.read_text())"
+    try:
+        own = SESSION.read_text()
+    except OSError:
+        pytest.skip("this system does not group sessions")
+    if "nice" not in own:
+        pytest.skip("this system does not group sessions")
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", program], start_new_session=is_leader, capture_output=True, text=True, check=True
+        ).stdout.split()[-1]
+        for is_leader in (True, False)
+    ]
+    assert found == ["5", own.split()[-1]]

@@ -17,6 +17,7 @@ SIDE_N = 54.0  # of the hand on the rim; where the pads slip, the finger beside 
 SPARE_M = 0.001
 LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand
 SLACK_RAD = 0.03
+LEARNT_SHARE = 0.5  # pads that have slipped a little lose nothing in the next hold
 MOST_LOST_RAD = 0.15  # what pads, fingers and arm yield under the torque of a heavy wheel
 POOR_FRICTION = 0.3  # of pads on paint, with which the first grip across a wheel reckons
 SPARE_GRIP = 1.3
@@ -94,7 +95,8 @@ class Belief:
         (hold, begun_rad, expected_rad), self._last = self._last, None
         felt_rad, moved_rad = abs(expected_rad - begun_rad), abs(seen_rad - begun_rad)
         if moved_rad >= LEAST_SHARE * felt_rad - SLACK_RAD:
-            self.lost_rad = float(np.clip(self.lost_rad + felt_rad - moved_rad, 0.0, MOST_LOST_RAD))
+            lost_rad = self.lost_rad + LEARNT_SHARE * (felt_rad - moved_rad)
+            self.lost_rad = float(np.clip(lost_rad, 0.0, MOST_LOST_RAD))
             return 0.0
         self.slipped(hold)
         return felt_rad - moved_rad

@@ -63,10 +63,13 @@ def test_what_springs_back_when_the_wheel_is_let_go_is_added_to_the_next_turn() 
     belief = Belief(effort_nm=2.0)
     belief.turned(Hold.ACROSS, 1.15, 1.97)
     belief.learn(1.87)
-    assert belief.lost_rad == pytest.approx(0.1)
+    assert belief.lost_rad == pytest.approx(0.05)
     belief.turned(Hold.ACROSS, 1.87, 1.97)  # by what was felt, less what is lost
-    belief.learn(2.0)
-    assert belief.lost_rad == pytest.approx(0.07)
+    belief.learn(1.95)
+    assert belief.lost_rad == pytest.approx(0.06)
+    belief.turned(Hold.ACROSS, 1.95, 1.97)
+    belief.learn(1.99)
+    assert belief.lost_rad == pytest.approx(0.05)
 
 
 def test_what_was_not_turned_teaches_nothing() -> None:

@@ -177,16 +177,18 @@ class WheelTurn:
         return self.attempt.run(motion)
 
     def _yielding(self) -> Compliance:
-        """Return how the hand yields: along the fingers, with the rim between them also radially.
+        """Return how the hand yields: along the fingers, with the rim or the whole wheel between them also along their line.
 
+        Across that line it does not yield then: of two pads on a wheel one slips first, and the push of the other moved a
+        hand that yielded 6 mm off the hub.
         Behind spokes it yields across the line of the fingers until both push equally. Along that line it yields as soon as
         the wheel moves, or at once behind opposite spokes, down to the force with which these spokes push: what is more is
         friction on the spokes, along which fingers slide that do not turn about the true hub.
         """
         along = 400.0
         stiffness = (200.0, 200.0, along)
-        if self.open_m is not None and not self.is_across:
-            stiffness = (50.0, INF, along)
+        if self.open_m is not None:
+            stiffness = (200.0 if self.is_across else 50.0, INF, along)
         elif self.side_per_nm > SLIGHT_PER_NM and not self._felt.is_moving:
             stiffness = (INF, 200.0, along)
         is_loading = self.open_m is None and not self._felt.is_moving

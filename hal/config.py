@@ -13,6 +13,7 @@ from hal.devices import DeviceKind
 from hal.errors import ConfigError
 from hal.outlets import OutletsSection
 from hal.panel import Panel, load_panel
+from hal.panel.turn import meant_otherwise
 from hal.plant import HistorySection, ReviewSection, RoundSection
 from hal.simulated_events import EventSection
 from hal.strict import Strict, load_toml
@@ -226,8 +227,9 @@ class CellFile(Strict):
                 known = f"devices: {', '.join(self.devices)}"
                 raise ValueError(f"emulators.{name} must have the name of the device that it emulates; {known}")
         names = [one.name for one in self.rounds]
-        if len(set(names)) < len(names):
-            raise ValueError("two of the rounds have the same name; give each its own")
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise meant_otherwise(f"several rounds are called {', '.join(twice)}", "give each round its own name")
         if self.emulators and self.cell.mode == "real":
             raise ValueError("emulators need cell.mode = 'mixed' or 'sim'")
         if self.simulation.cables and self.cell.mode == "real":

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from hal.panel.turn import meant_otherwise
 from hal.strict import Strict
 
 Port = Annotated[int, Field(ge=1, le=65535)]
@@ -76,9 +77,9 @@ class OpcuaSection(Strict):
             description="folder with certificates (PEM or DER) of the clients that may connect, or of their authorities"
         ),
     ] = None
-    acknowledge: Annotated[bool, Field(description="clients may acknowledge alarms; nothing else can be called")] = (
-        False
-    )
+    acknowledge: Annotated[
+        bool, Field(description="clients may acknowledge alarms and comment on them; nothing else can be called")
+    ] = False
     key_file: Annotated[
         str | None, Field(description="file with an operator's key, by which alarms are acknowledged")
     ] = None
@@ -106,6 +107,13 @@ class OutletsSection(Strict):
     prometheus: PrometheusSection | None = None
     opcua: OpcuaSection | None = None
     sparkplug: SparkplugSection | None = None
+
+    @model_validator(mode="after")
+    def _listen_at_different_ports(self) -> OutletsSection:
+        if self.prometheus is not None and self.opcua is not None and self.prometheus.port == self.opcua.port:
+            told = f"prometheus and opcua both listen at port {self.opcua.port}"
+            raise meant_otherwise(told, "give each a port of its own")
+        return self
 
     @property
     def is_empty(self) -> bool:

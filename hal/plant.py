@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from difflib import get_close_matches
 from typing import Annotated, Literal
-from zoneinfo import ZoneInfo
+from zoneinfo import ZoneInfo, available_timezones
 
 from pydantic import Field, field_validator
 
+from hal.panel.turn import meant_otherwise
 from hal.strict import Strict
+
+CRON_HINT = "minute 0-59, hour 0-23, day 1-31, month 1-12 and weekday 0-7 or MON-SUN, such as 0 6 * * MON-FRI"
 
 
 class HistorySection(Strict):
@@ -71,13 +75,14 @@ class RoundSection(Strict):
         from cronsim import CronSim, CronSimError  # only cells with rounds need it
 
         if len(text.split()) != 5:
-            raise ValueError(f"{text!r} has {len(text.split())} fields instead of 5: minute hour day month weekday")
+            raise meant_otherwise(f"{text!r} has {len(text.split())} fields instead of 5", CRON_HINT)
         try:
             next(CronSim(text, datetime.now(UTC)))
         except StopIteration:
-            raise ValueError(f"{text!r} names no day that ever comes") from None
+            raise meant_otherwise(f"{text!r} names no day that ever comes", CRON_HINT) from None
         except (CronSimError, ValueError) as error:
-            raise ValueError(f"{text!r} is no cron expression: {error}") from None
+            why = str(error).removeprefix("Bad ")
+            raise meant_otherwise(f"{text!r} is no cron expression: its {why} cannot be meant", CRON_HINT) from None
         return text
 
     @field_validator("zone")
@@ -86,5 +91,7 @@ class RoundSection(Strict):
         try:
             ZoneInfo(name)
         except (LookupError, ValueError, OSError):
-            raise ValueError(f"{name!r} is no IANA time zone; write for example Europe/Vienna") from None
+            near = get_close_matches(name, available_timezones(), n=1)
+            hint = f"did you mean {near[0]!r}?" if near else "write for example Europe/Vienna"
+            raise meant_otherwise(f"{name!r} is no IANA time zone", hint) from None
         return name

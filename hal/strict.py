@@ -12,6 +12,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hal.errors import ConfigError
+from hal.fault_words import in_words, is_echo
 
 M = TypeVar("M", bound="Strict")
 REFERENCE = "see the file reference in docs/"
@@ -83,11 +84,15 @@ def toml_data(text: str, *, source: str) -> dict[str, Any]:
     """Return TOML text as plain data; `source` names it in errors.
 
     Raises:
-        ConfigError: it is not TOML. A number of more digits and arrays within more arrays than Python reads count as that.
+        ConfigError: it is not TOML, or arrays stand within more arrays than Python reads.
     """
     try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+        return tomllib.loads(text.removeprefix("\ufeff"))  # some editors write a byte-order mark before the first key
+    except RecursionError as error:
+        raise ConfigError(
+            f"{source}: lists and tables stand too deep within each other", hint="nest fewer of them", file=source
+        ) from error
+    except ValueError as error:
         raise ConfigError(
             f"{source} is not valid TOML: {error}", hint="look at that line; strings need quotes", file=source
         ) from error
@@ -132,7 +137,7 @@ def _parsed(data: dict[str, Any], model: type[M]) -> M:
 
 
 def _faults(error: ValidationError, data: dict[str, Any], model: type[Strict]) -> list[FieldFault]:
-    found = error.errors()
+    found = [item for item in error.errors() if not is_echo(item)]
     known = {(item["loc"], item["msg"]) for item in found}
     found += [item for item in model.further_faults(data) if (item["loc"], item["msg"]) not in known]
     # A misspelt key also makes the correct key missing. The misspelling is what must be corrected, so it comes first.
@@ -152,6 +157,10 @@ def _fault(item: Any, model: type[BaseModel]) -> FieldFault:
         return FieldFault(key, item["msg"], hint)
     if item["type"] == "value_error":
         return FieldFault(key, item["msg"].removeprefix("Value error, "), REFERENCE)
+    words = in_words(item)
+    if words is not None:
+        text, remedy, below = words
+        return FieldFault(".".join(filter(None, (key, below))), text, remedy)
     said = f"{item['msg']} (given: {given[:60]})"
     return FieldFault(key, said, f"{REFERENCE} for type, unit and range")
 

@@ -12,10 +12,11 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationError, model_validator
 
+from hal.fault_words import ONE_LINE
 from hal.panel.angles import fault
 from hal.panel.form import Cap, Envelope, Face, Relief, Rim
 from hal.panel.goals import GAUGE_SHARE, Goal, Shown
-from hal.panel.limits import Limits, Priority
+from hal.panel.limits import Limits, Priority, beyond_range
 from hal.panel.parts import Name, Positive, Vector2, Vector3
 from hal.panel.questions import Question, Taught
 from hal.strict import Strict
@@ -36,7 +37,7 @@ class PanelObject(Strict, ABC):
         Positive | None, Field(description="age of its newest valid reading from which an alarm is raised")
     ] = None
     priority: Annotated[Priority, Field(description="of its alarms")] = "medium"
-    what_to_do: Annotated[str, Field(max_length=500, description="shown with its alarms")] = ""
+    what_to_do: Annotated[str, Field(max_length=500, pattern=ONE_LINE, description="shown with its alarms")] = ""
     forbidden: Annotated[bool, Field(description="nothing operates it")] = False
     confirm: Annotated[bool, Field(description="it is operated only when the request names it a second time")] = False
 
@@ -61,8 +62,13 @@ class PanelObject(Strict, ABC):
         if self.limits is not None and states:
             hint = f"write normal = [...] with some of its states: {', '.join(states)}"
             faults.append(fault(("limits",), self.name, f"a {self.kind} shows states and no value", hint))
+        for name, told in beyond_range(self).items():
+            faults.append(fault(("limits", name), self.name, told, "stay within that range"))
         if self.normal is not None and not states and (self.full_scale is not None or self.value_is_angle):
             faults.append(fault(("normal",), self.name, f"a {self.kind} shows a value and no state", "write limits"))
+        if states and set(states) <= set(self.normal or ()):
+            told = "every state is normal, so there is never an alarm"
+            faults.append(fault(("normal",), self.name, told, "leave it out, or name fewer states"))
         for k, state in enumerate(self.normal or ()):
             if states and state not in states:
                 hint = f"its states: {', '.join(states)}"

@@ -89,7 +89,7 @@ class NumberGoal:
         Raises:
             InvalidRequest: no number is given, or it is not within the limits of the object called `name`.
         """
-        hint = f"send {{'object': '{name}', '{self.key}': ...}}"
+        hint = f"give {self.key} within that range"
         wanted = f"{name} needs {self.key} from {self.low:g} to {self.high:g} {self.unit}".rstrip()
         if not isinstance(asked, float | int):
             raise InvalidRequest(wanted, hint=hint)

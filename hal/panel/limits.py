@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from hal.panel.base import PanelObject
 
 Priority = Literal["low", "medium", "high", "urgent"]
+LONGEST_DELAY_S = 7 * 86_400.0
 ORDER = ("low_low", "low", "high", "high_high")
 
 
@@ -28,7 +29,10 @@ class Limits(Strict):
     deadband: Annotated[
         NotNegative, Field(description="an alarm ends when the value is inside of its limit by this much")
     ] = 0.0
-    delay_s: Annotated[NotNegative, Field(description="how long a value must be beyond a limit before an alarm")] = 0.0
+    delay_s: Annotated[
+        NotNegative,
+        Field(le=LONGEST_DELAY_S, description="how long a value must be beyond a limit before an alarm"),
+    ] = 0.0
     rate_per_s: Annotated[Positive | None, Field(description="greatest change per second between two readings")] = None
 
     @model_validator(mode="after")
@@ -43,7 +47,7 @@ class Limits(Strict):
         }
         above = [value for name, value in given.items() if name.startswith("high")]
         below = [value for name, value in given.items() if name.startswith("low")]
-        if above and below and self.deadband >= min(above) - max(below):
+        if above and below and self.deadband > 0.0 and self.deadband >= min(above) - max(below):
             what = f"deadband = {self.deadband:g} is not smaller than the room between the limits"
             faults[what] = "an alarm could never end: give a smaller deadband"
         if faults:
@@ -62,3 +66,30 @@ def unit_of(panel_object: PanelObject) -> str:
         return "rad"
     scale = getattr(panel_object, "scale", None)
     return str(getattr(panel_object if scale is None else scale, "unit", ""))
+
+
+def range_of(panel_object: PanelObject) -> tuple[float, float] | None:
+    """Return the smallest and the largest value that an object can show; None if it has no such range."""
+    goal = panel_object.goal if panel_object.value_is_angle else None
+    scale = getattr(panel_object, "scale", None) or panel_object
+    low = getattr(scale, "minimum", None) if goal is None else getattr(goal, "low", None)
+    high = getattr(scale, "maximum", None) if goal is None else getattr(goal, "high", None)
+    return None if low is None or high is None else (float(low), float(high))
+
+
+def beyond_range(panel_object: PanelObject) -> dict[str, str]:
+    """Return what is wrong with limits beyond which, or inside of which, no value of the object can be; by the limit's key."""
+    found, limits = range_of(panel_object), panel_object.limits
+    if found is None or limits is None:
+        return {}
+    low, high = found
+    shows = f"{panel_object.name} shows {low:g} to {high:g} {unit_of(panel_object)}".rstrip()
+    faults = {
+        name: f"{shows}, and no value is beyond {limit:g}"
+        for name, limit in limits.given.items()
+        if not (low <= limit < high if name.startswith("high") else low < limit <= high)
+    }
+    room = [limit - low if name.startswith("high") else high - limit for name, limit in limits.given.items()]
+    if not faults and room and limits.deadband > min(room):
+        faults["deadband"] = f"{shows}, and no value is {limits.deadband:g} inside of each limit"
+    return faults

@@ -44,7 +44,7 @@ def check_mission(name: Name, cell: CellOption = DEFAULT_CELL) -> None:
 
     loaded = load_cell(find_cell(cell))
     if name.endswith(".toml"):
-        checked(parse_mission(read_text(Path(name), FILE), loaded.panel, source=name), loaded, source=name)
+        checked(parse_mission(read_text(Path(name), FILE), loaded, source=name), loaded, source=name)
     else:
         checked_file(name, loaded)
     console.print(f"{name} fits panel {loaded.panel.name}", style="green")

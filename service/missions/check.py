@@ -13,12 +13,11 @@ from hal.entry_points import registered
 from hal.errors import CellError, InvalidRequest
 from hal.panel import Panel, PanelObject
 from hal.panel.kinds import SKILLS, has_part
-from hal.panel.limits import unit_of
 from hal.strict import FieldFault
+from service.missions.condition_check import faulty_conditions
 from service.schema.mission_file import (
     CallStep,
     ChooseStep,
-    Condition,
     InspectStep,
     MissionFile,
     RepeatStep,
@@ -31,6 +30,7 @@ from service.schema.requests import ActionBody
 
 Load = Callable[[str], MissionFile]
 ONE_STEP: TypeAdapter[Step] = TypeAdapter(Step)
+MOST_RUNS = 10_000  # steps that one mission may run, counted with its repetitions and calls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,15 +63,39 @@ def check_mission(mission: MissionFile, panel: Panel, load: Load, *, source: str
             library[name] = load(name)
         except CellError as error:
             faults.append((caller, FieldFault(f"{key}.mission", error.what, error.hint)))
+            more = error.details.get("faults", [])[1:]
+            faults += [(f"missions/{name}.toml", FieldFault("", str(fault), "see above")) for fault in more]
             continue
         below = list(_calls(library[name].steps, "steps"))
         calls[name] = {called for _, called in below}
         faults += [(f"missions/{name}.toml", fault) for fault in _faults_of(library[name].steps, "steps", panel)]
         waiting += [(f"missions/{name}.toml", inner, called) for inner, called in below]
     faults += [(source, fault) for fault in _circles(calls)]
+    if not faults and (runs := _runs(mission.steps, library)) > MOST_RUNS:
+        told = f"with all repetitions and calls it has {runs:.4g} steps, and at most {MOST_RUNS} are run"
+        faults.append((source, FieldFault("steps", told, "repeat less often")))
     if faults:
         raise _refusal(faults)
     return Checked(mission=mission, library=library)
+
+
+def _runs(steps: Sequence[Step], library: Mapping[str, MissionFile], known: dict[str, int] | None = None) -> int:
+    """Return how many steps are run at most; `known` has the counts of called missions, each of which is counted once."""
+    counts = {} if known is None else known
+    found = 0
+    for step in steps:
+        match step:
+            case ChooseStep():
+                found += 1 + max(_runs(step.then, library, counts), _runs(step.otherwise, library, counts))
+            case RepeatStep():
+                found += 1 + step.times * _runs(step.steps, library, counts)
+            case CallStep():
+                if step.mission not in counts:
+                    counts[step.mission] = _runs(library[step.mission].steps, library, counts)
+                found += 1 + counts[step.mission]
+            case _:
+                found += 1
+    return found
 
 
 def _refusal(faults: Sequence[tuple[str, FieldFault]]) -> InvalidRequest:
@@ -83,15 +107,31 @@ def _refusal(faults: Sequence[tuple[str, FieldFault]]) -> InvalidRequest:
     )
 
 
-def faults_of_valid_steps(steps: object, panel: Panel) -> list[FieldFault]:
-    """Return what the panel contradicts in plain data of steps, of which some may be malformed; those are passed over."""
+def faults_of_valid_steps(steps: object, panel: Panel, load: Load, at: str = "steps") -> list[FieldFault]:
+    """Return what panel and other missions contradict in plain data of steps, of which some may be malformed.
+
+    A malformed step is passed over, and the steps within it are not.
+
+    Args:
+        load: returns the mission file of a name; raises `CellError`.
+        at: key of the steps.
+    """
     found: list[FieldFault] = []
     for k, plain in enumerate(steps if isinstance(steps, list) else ()):
+        key = f"{at}.{k}"
         try:
             step = ONE_STEP.validate_json(json.dumps(plain, default=str), strict=True)
         except ValidationError:
+            for inner in ("then", "otherwise", "steps") if isinstance(plain, dict) else ():
+                found += faults_of_valid_steps(plain.get(inner), panel, load, f"{key}.{inner}")
             continue
-        found += _faults_of_step(step, f"steps.{k}", panel)
+        found += _faults_of_step(step, key, panel)
+        for called, name in _calls((step,), at):
+            try:
+                load(name)
+            except CellError as error:
+                place = called.removeprefix(f"{at}.0")
+                found.append(FieldFault(f"{key}{place}.mission", error.what, error.hint))
     return found
 
 
@@ -122,7 +162,7 @@ def target_of(panel_object: PanelObject, action: ActionBody) -> str | float:
         )
     for other in sorted({"state", "value", "angle_rad"} - {goal.key}):  # refused, because its meaning would be a guess
         if getattr(action, other) is not None:
-            hint = f"send {{'object': '{panel_object.name}', '{goal.key}': ...}}"
+            hint = f"give {goal.key}, and leave {other} out"
             what = f"{panel_object.name} is a {panel_object.kind}: it takes {goal.key}, not {other}"
             raise InvalidRequest(what, hint=hint)
     target = goal.checked(panel_object.name, getattr(action, goal.key))
@@ -136,21 +176,24 @@ def _faults_of(steps: Sequence[Step], at: str, panel: Panel) -> Iterator[FieldFa
 
 
 def _faults_of_step(step: Step, key: str, panel: Panel) -> Iterator[FieldFault]:
-    yield from _faulty_conditions(step.needs, f"{key}.needs", panel)
+    yield from faulty_conditions(step.needs, f"{key}.needs", panel)
     match step:
         case InspectStep():
-            for j, name in enumerate(step.objects or ()):
+            names = step.objects or ()
+            for j, name in enumerate(names):
                 yield from _said(f"{key}.objects.{j}", partial(panel.object, name))
+                if name in names[:j]:
+                    yield FieldFault(f"{key}.objects.{j}", f"{name} is named already", "leave it out")
         case SetStep(object=str(name)):
             yield from _said(f"{key}.object", partial(_check_set, step, name, panel))
         case RequireStep() | WaitStep():
-            yield from _faulty_conditions(step.conditions, f"{key}.conditions", panel)
+            yield from faulty_conditions(step.conditions, f"{key}.conditions", panel)
         case ChooseStep():
-            yield from _faulty_conditions(step.when, f"{key}.when", panel)
+            yield from faulty_conditions(step.when, f"{key}.when", panel)
             yield from _faults_of(step.then, f"{key}.then", panel)
             yield from _faults_of(step.otherwise, f"{key}.otherwise", panel)
         case RepeatStep():
-            yield from _faulty_conditions(step.until, f"{key}.until", panel)
+            yield from faulty_conditions(step.until, f"{key}.until", panel)
             yield from _faults_of(step.steps, f"{key}.steps", panel)
 
 
@@ -162,34 +205,6 @@ def _check_set(step: SetStep, name: str, panel: Panel) -> None:
     if panel_object.goal is None:
         raise InvalidRequest(f"{panel_object.name} cannot be operated: it is read only", hint="leave the step out")
     operable(panel_object, step.action())
-
-
-def _faulty_conditions(conditions: Sequence[Condition], at: str, panel: Panel) -> Iterator[FieldFault]:
-    for k, condition in enumerate(conditions):
-        key = f"{at}.{k}"
-        try:
-            panel_object = panel.object(condition.object)
-        except InvalidRequest as error:
-            yield FieldFault(f"{key}.object", error.what, error.hint)
-            continue
-        yield from _faulty_condition(condition, key, panel_object)
-
-
-def _faulty_condition(condition: Condition, key: str, panel_object: PanelObject) -> Iterator[FieldFault]:
-    name, states, unit = panel_object.name, panel_object.states_shown, unit_of(panel_object)
-    if condition.state is not None:
-        if not states and panel_object.full_scale is not None:
-            yield FieldFault(f"{key}.state", f"{name} shows a value and no state", "give below or above")
-        elif states and condition.state not in states:
-            yield FieldFault(f"{key}.state", f"{name} has no state {condition.state!r}", f"states: {', '.join(states)}")
-        return
-    if states:
-        hint = f"give state; its states: {', '.join(states)}"
-        yield FieldFault(key, f"{name} shows states and no value", hint)
-    elif condition.unit != (unit or None):
-        told = f"the unit of {name} is {unit!r}" if unit else f"{name} has no unit"
-        given = "none is given" if condition.unit is None else f"{condition.unit!r} is given"
-        yield FieldFault(f"{key}.unit", f"{told}, and {given}", f"write unit = {unit!r}" if unit else "leave unit out")
 
 
 def _said(key: str, work: Callable[[], object]) -> Iterator[FieldFault]:

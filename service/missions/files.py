@@ -10,8 +10,7 @@ from pathlib import Path
 
 from hal.atomic_write import write_atomically
 from hal.config import Cell
-from hal.errors import ConfigError
-from hal.panel import Panel
+from hal.errors import ConfigError, InvalidRequest
 from hal.strict import faults_in, read_text, refusal, toml_data, validate
 from service.errors import FileFault, NoSuchMission, NotPossibleNow
 from service.missions.check import Checked, check_mission, faults_of_valid_steps
@@ -40,8 +39,8 @@ def mission_paths(cell: Cell) -> dict[str, Path]:
     return found
 
 
-def load_mission(name: str, cell: Cell) -> MissionFile:
-    """Read the mission file called `name`.
+def load_mission(name: str, cell: Cell, *, below: tuple[str, ...] = ()) -> MissionFile:
+    """Read the mission file called `name`; `below` as for `parse_mission`.
 
     Raises:
         ConfigError: there is no such file, or it is malformed; names file, key and remedy.
@@ -51,19 +50,29 @@ def load_mission(name: str, cell: Cell) -> MissionFile:
         near = get_close_matches(name, paths, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"missions: {', '.join(sorted(paths)) or 'none'}"
         raise ConfigError(f"there is no mission file {name!r}", hint=hint)
-    return parse_mission(read_text(paths[name], FILE), cell.panel, source=str(paths[name]))
+    return parse_mission(read_text(paths[name], FILE), cell, source=str(paths[name]), below=(*below, name))
 
 
-def parse_mission(text: str, panel: Panel, *, source: str) -> MissionFile:
-    """Return a mission from the text of its file; `source` names it in errors.
+def parse_mission(text: str, cell: Cell, *, source: str, below: tuple[str, ...] = ()) -> MissionFile:
+    """Return a mission from the text of its file.
+
+    Args:
+        source: names it in errors.
+        below: missions whose calls led to it, so that malformed ones that call each other end.
 
     Raises:
-        ConfigError: it is malformed; names all faults, among them what the panel contradicts in the steps that are well-formed.
+        ConfigError: it is malformed; names all faults, among them what panel and missions contradict in its well-formed steps.
     """
     data = toml_data(text, source=source)
     malformed = faults_in(data, MissionFile)
     if malformed:
-        raise refusal([*malformed, *faults_of_valid_steps(data.get("steps"), panel)], source=source)
+
+        def load(called: str) -> MissionFile:
+            if called in below:
+                raise InvalidRequest(f"mission {called!r} calls itself", hint="take one call of the circle out")
+            return load_mission(called, cell, below=below)
+
+        raise refusal([*malformed, *faults_of_valid_steps(data.get("steps"), cell.panel, load)], source=source)
     return validate(data, MissionFile, source=source)
 
 
@@ -74,7 +83,7 @@ def checked_text(name: str, text: str, cell: Cell) -> Checked:
         ConfigError, InvalidRequest: names every fault.
     """
     source = f"missions/{name}.toml"
-    mission = parse_mission(text, cell.panel, source=source)
+    mission = parse_mission(text, cell, source=source, below=(name,))
 
     def load(called: str) -> MissionFile:
         return mission if called == name else load_mission(called, cell)

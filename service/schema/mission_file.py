@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from hal.fault_words import ONE_LINE
 from hal.panel.turn import meant_otherwise
 from hal.strict import Strict
 from service.schema.requests import ActionBody, ObjectName, Touches, WantedPose
@@ -16,6 +17,7 @@ MissionName = Annotated[
     str, Field(pattern=r"^[a-z][a-z0-9_-]{0,60}$", description="name of a mission file without its ending")
 ]
 MOST_STEPS = 200
+FEWEST_TRIES = 2
 
 
 class Condition(Strict):
@@ -40,6 +42,8 @@ class Condition(Strict):
         if self.below is not None and self.above is not None and self.above >= self.below:
             what = f"no value is above {self.above:g} and below {self.below:g}"
             raise meant_otherwise(what, "swap them, or leave one out")
+        if self.state is not None and self.unit is not None:
+            raise meant_otherwise("a state has no unit", "leave unit out")
         return self
 
 
@@ -59,7 +63,15 @@ class StepBase(Strict):
         Literal["stop", "skip", "retry"],
         Field(description="stop: end the mission and park; skip: go on with the next step; retry: again, then stop"),
     ] = "stop"
-    tries: Annotated[int, Field(ge=2, le=10, description="tries in all, with on_failure = retry")] = 2
+    tries: Annotated[int, Field(ge=FEWEST_TRIES, le=10, description="tries in all, with on_failure = retry")] = (
+        FEWEST_TRIES
+    )
+
+    @model_validator(mode="after")
+    def _tries_again(self) -> Self:
+        if self.tries != FEWEST_TRIES and self.on_failure != "retry":
+            raise meant_otherwise("tries is of use only with on_failure = 'retry'", "add that, or leave tries out")
+        return self
 
 
 class InspectStep(StepBase):
@@ -101,6 +113,8 @@ class SetStep(StepBase):
         targets += ["other"] if self.other else []
         if self.each_kind == (self.object is not None):
             raise meant_otherwise("a step sets one object, or one of each kind", "give object, or each_kind = true")
+        if self.each_kind and self.confirm is not None:
+            raise meant_otherwise("confirm names one object, and each_kind sets one of each kind", "leave confirm out")
         if len(targets) > 1 or (self.each_kind and targets):
             given = ", ".join(targets)
             raise meant_otherwise(f"{given} cannot be given together here", "keep one; none with each_kind")
@@ -170,16 +184,25 @@ class MissionFile(Strict):
     """A mission: its steps run one after the other, after the panel has been located and its objects found."""
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
-    title: Annotated[str, Field(max_length=200)] = ""
+    title: Annotated[str, Field(max_length=200, pattern=ONE_LINE)] = ""
     limits: MissionLimits = MissionLimits()
     steps: Annotated[tuple[Step, ...], Field(min_length=1, max_length=MOST_STEPS)]
 
     @model_validator(mode="after")
     def _names_are_different(self) -> MissionFile:
-        repeated = sorted(name for name, count in Counter(_names(self.steps)).items() if count > 1)
+        repeated = _repeated(_names(self.steps))
         if repeated:
-            raise meant_otherwise(f"several steps are called {', '.join(repeated)}", "give each step its own name")
+            raise meant_otherwise(*repeated)
         return self
+
+    @classmethod
+    def further_faults(cls, data: dict[str, Any]) -> list[Any]:
+        """Return names that stand at several steps, which are not looked for if a step is malformed."""
+        repeated = _repeated(_plain_names(data.get("steps")))
+        if not repeated:
+            return []
+        text, hint = repeated
+        return [{"type": "names", "loc": (), "msg": text, "input": None, "ctx": {"hint": hint}}]
 
 
 def conditions_of(step: Step) -> tuple[Condition, ...]:
@@ -192,6 +215,22 @@ def conditions_of(step: Step) -> tuple[Condition, ...]:
         case RepeatStep():
             return (*step.needs, *step.until)
     return step.needs
+
+
+def _repeated(names: list[str]) -> tuple[str, str] | None:
+    """Return what is wrong with names that are not all different, and what to do."""
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
+    return (f"several steps are called {', '.join(repeated)}", "give each step its own name") if repeated else None
+
+
+def _plain_names(steps: Any) -> list[str]:
+    """Return the names of steps in plain data, of which anything may be malformed."""
+    found: list[str] = []
+    for step in steps if isinstance(steps, list) else ():
+        if isinstance(step, dict):
+            found += [step["name"]] if isinstance(step.get("name"), str) else []
+            found += [name for key in ("then", "otherwise", "steps") for name in _plain_names(step.get(key))]
+    return found
 
 
 def _names(steps: tuple[Step, ...]) -> list[str]:

@@ -90,11 +90,11 @@ def test_a_cell_file_is_read_with_all_it_points_to(cell_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "key", "hint"),
     [
-        ('mode = "sim"', 'mode = "sin"', "cell.mode", "docs"),
+        ('mode = "sim"', 'mode = "sin"', "cell.mode", "did you mean 'sim'?"),
         ("seed = 7", "sed = 7", "cell.sed", "did you mean 'seed'?"),
-        ("seed = 7", 'seed = "7"', "cell.seed", "docs"),
+        ("seed = 7", 'seed = "7"', "cell.seed", "give a whole number"),
         ('driver = "sim:arm"', 'drver = "sim:arm"', "devices.arm", ""),
-        ('kind = "arm"', 'kind = "leg"', "devices.arm.kind", "docs"),
+        ('kind = "arm"', 'kind = "leg"', "devices.arm.kind", ""),
         ("panel_position_m = [0.8, 0.0, 0.5]", "panel_position_mm = [800, 0, 500]", "workspace", ""),
         ("panel_position_m = [0.8, 0.0, 0.5]", "panel_position_m = [nan, 0.0, 0.5]", "workspace.panel_position_m", ""),
         ('panel = "panels/tiny.toml"', 'panel = "panels/tinny.toml"', "cell.panel", "relative"),

@@ -232,7 +232,7 @@ def test_what_cannot_be_recorded_does_not_take_place_and_is_made_up_for_later(tm
         ),
         ({"limits": {}}, "no limit is given"),
         ({"limits": {"low": 4.0, "high": 5.0, "deadband": 1.0}}, "deadband = 1"),
-        ({"limits": {"high": 5.0, "delay_s": -1.0}}, "greater than or equal to 0"),
+        ({"limits": {"high": 5.0, "delay_s": -1.0}}, "is not at least 0"),
         ({"limits": {"hihg": 5.0}}, "unknown key 'hihg'"),
         ({"normal": ["on"]}, "shows a value and no state"),
         ({"priority": "huge"}, "priority"),
@@ -264,3 +264,29 @@ def test_all_faults_of_limits_and_states_are_told_at_once() -> None:
     faults = " ".join(caught.value.details["faults"])
     assert "objects.0.normal.0: pump has no state 'onn'; its states: on, off" in faults
     assert "objects.1.limits: a lamp shows states and no value" in faults
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (
+            {"limits": {"high": 60.0, "low": -3.0}},
+            "objects.0.limits.high: pressure shows 0 to 10 bar, and no value is beyond 60",
+        ),
+        ({"limits": {"high": 3.0, "deadband": 5.0}}, "objects.0.limits.deadband: pressure shows 0 to 10 bar"),
+        ({"limits": {"high": 3.0, "delay_s": 1e9}}, "objects.0.limits.delay_s: 1000000000.0 is not at most 604800"),
+        ({"what_to_do": "a\0b"}, "write one line without control characters"),
+    ],
+)
+def test_limits_that_no_value_can_reach_or_leave_are_refused(given: dict[str, Any], told: str) -> None:
+    scale = {"minimum": 0.0, "maximum": 10.0, "unit": "bar", "at_min": -2.0, "at_max": 2.0}
+    gauge = {"kind": "gauge", "name": "pressure", "position_m": [0.1, 0.1], "radius_m": 0.03, "scale": scale, **given}
+    with pytest.raises(ConfigError) as caught:
+        validate({"name": "p", "width_m": 0.6, "height_m": 0.4, "objects": [gauge]}, Panel, source="panel.toml")
+    assert told in " ".join(caught.value.details["faults"])
+
+
+def test_states_that_are_all_normal_would_never_raise_an_alarm() -> None:
+    lamp = {"kind": "lamp", "name": "pump", "position_m": [0.1, 0.1], "radius_m": 0.01, "normal": ["on", "off"]}
+    with pytest.raises(ConfigError, match="every state is normal"):
+        validate({"name": "p", "width_m": 0.6, "height_m": 0.4, "objects": [lamp]}, Panel, source="panel.toml")

@@ -105,6 +105,88 @@ def test_a_malformed_file_is_refused_by_its_name(tmp_path: Path, text: str, word
     assert words in f"{caught.value.what} {caught.value.hint}"
 
 
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        (
+            {"kind": "require", "conditions": [{"object": "pressure", "above": 600.0, "unit": "bar"}]},
+            "no value is above 600",
+        ),
+        (
+            {"kind": "require", "conditions": [{"object": "pressure", "below": 600.0, "unit": "bar"}]},
+            "every value is below",
+        ),
+        (
+            {"kind": "require", "conditions": [{"object": "pump", "state": "on"}, {"object": "pump", "state": "off"}]},
+            "conditions.1: it can never be met together with steps.0.conditions.0",
+        ),
+        (
+            {
+                "kind": "require",
+                "conditions": [
+                    {"object": "pressure", "below": 3.0, "unit": "bar"},
+                    {"object": "pressure", "above": 5.0, "unit": "bar"},
+                ],
+            },
+            "it can never be met together",
+        ),
+        ({"kind": "inspect", "objects": ["flow", "flow"]}, "steps.0.objects.1: flow is named already"),
+        (
+            {
+                "kind": "repeat",
+                "times": 1000,
+                "steps": [
+                    {"kind": "repeat", "name": "b", "times": 1000, "steps": [{"kind": "inspect", "name": "c"}]},
+                ],
+            },
+            "at most 10000 are run",
+        ),
+    ],
+)
+def test_what_nothing_can_meet_or_end_is_a_fault(step: dict[str, Any], words: str) -> None:
+    (fault,) = steps(step)
+    assert words in fault
+
+
+def test_a_malformed_file_tells_also_what_its_sound_steps_cannot_mean(tmp_path: Path) -> None:
+    text = """
+titel = "x"
+[[steps]]
+kind = "fel"
+name = "a"
+[[steps]]
+kind = "choose"
+name = "b"
+when = []
+then = [{ kind = "set", name = "a", object = "pmp", state = "on" }]
+[[steps]]
+kind = "call"
+name = "d"
+mission = "no_such"
+"""
+    with pytest.raises(ConfigError) as caught:
+        checked_file("mine", beside(tmp_path, mine=text))
+    told = "\n".join(caught.value.details["faults"])
+    for words in (
+        "titel: unknown key 'titel'; did you mean 'title'?",
+        "steps.0.kind: there is no kind 'fel'; did you mean 'feel'?",
+        "steps.1.when: it has 0 entries",
+        "several steps are called a; give each step its own name",
+        "steps.1.then.0.object: no object called 'pmp' on panel 'bench'; did you mean 'pump'?",
+        "steps.2.mission: there is no mission file 'no_such'",
+    ):
+        assert words in told
+    assert len(caught.value.details["faults"]) == 6
+
+
+def test_malformed_missions_that_call_each_other_are_refused(tmp_path: Path) -> None:
+    call = '[[steps]]\nkind = "fel"\nname = "x"\n[[steps]]\nkind = "call"\nname = "a"\nmission = "{}"'
+    cell = beside(tmp_path, one=call.format("two"), two=call.format("one"))
+    with pytest.raises(ConfigError) as caught:
+        checked_file("one", cell)
+    assert any("'one' calls itself" in fault or "two.toml" in fault for fault in caught.value.details["faults"])
+
+
 def test_a_circle_of_calls_is_refused(tmp_path: Path) -> None:
     call = '[[steps]]\nkind = "call"\nname = "a"\nmission = "{}"'
     cell = beside(tmp_path, one=call.format("two"), two=call.format("three"), three=call.format("two"))

@@ -87,7 +87,7 @@ def test_all_faults_are_told_at_once_and_nothing_is_stored(http: httpx2.Client, 
     told = "\n".join(found["faults"])
     for words in (
         "titel: unknown key 'titel'; did you mean 'title'?",
-        "steps.1.name: String should match pattern",
+        "steps.1.name: 'Feel it' is not written as it must be",
         "steps.0.objects.0: no object called 'pump_lampp' on panel 'fake'; did you mean 'pump_lamp'?",
         "steps.2.object: pump_lamp is a lamp, which cannot be operated",
     ):

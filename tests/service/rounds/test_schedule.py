@@ -66,7 +66,7 @@ def test_the_times_are_the_same_from_wherever_one_begins(cron: str, zone: str) -
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"cron": "0 25 * * *"}, "'0 25 * * *' is no cron expression: Bad hour"),
+        ({"cron": "0 25 * * *"}, "'0 25 * * *' is no cron expression: its hour cannot be meant"),
         ({"cron": "0 0 6 * * *"}, "has 6 fields instead of 5"),
         ({"cron": "0 0 30 2 *"}, "is no cron expression"),
         ({"cron": "0 6 * * *", "zone": "Europe/Wien"}, "'Europe/Wien' is no IANA time zone"),

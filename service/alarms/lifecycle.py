@@ -48,7 +48,8 @@ class Alarm:
         is_active: whether its condition holds, whatever its state.
         says: the condition as a sentence; empty if it never held.
         straddles: whether the interval of the value reaches over the limit, so that the condition is not certain.
-        changed_s, by, reason: when, by whom and why its state changed last; `by` is `the cell` for a reading or a time.
+        changed_s, by, reason: when, by whom and why its state changed last, or when and how somebody commented on it; `by` is
+            `the cell` for a reading or a time.
         key_name: the key that authorised that change; None for the cell, and while the service has no keys.
         raised_s: when its condition began to hold last; None if it never did.
         shelved_until_s: seconds since 1970; None unless it is shelved.

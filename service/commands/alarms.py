@@ -47,6 +47,18 @@ def acknowledge(alarm: AlarmId, *, by: By = None, reason: Reason = "", url: Url 
 
 
 @app.command()
+def comment(
+    alarm: AlarmId,
+    *,
+    reason: Annotated[str, typer.Option(help="What you say about it.")],
+    by: By = None,
+    url: Url = UrlDefault,
+) -> None:
+    """Comment on an alarm; its state stays."""
+    _post(url, alarm, "comment", {"by": by or getpass.getuser(), "reason": reason})
+
+
+@app.command()
 def shelve(
     alarm: AlarmId,
     *,

@@ -29,7 +29,9 @@ PRIORITIES = ("urgent", "high", "medium", "low")
 
 
 class AlarmView(BaseModel):
-    """An alarm. `is_active` says whether its condition holds, whatever its state; `by` is who changed the state last.
+    """An alarm. `is_active` says whether its condition holds, whatever its state.
+
+    `by` is who changed the state last, or commented on it.
 
     `straddles`: the interval of the value reaches over the limit, so that the condition is not certain.
     """
@@ -83,7 +85,7 @@ class ShelveRequest(Strict):
 
 
 class ServiceRequest(Strict):
-    """Who takes the alarm out of service, and why."""
+    """Who takes the alarm out of service, and why; or who comments on it, and how."""
 
     by: Holder
     reason: GivenReason
@@ -160,6 +162,17 @@ async def put_alarm_in_service(state: Shared, alarm: AlarmId, request: Acknowled
     return await _done(
         state, functools.partial(state.service.plant.alarms.put_in_service, alarm, **request.model_dump())
     )
+
+
+@router.post(
+    "/{alarm}/comment",
+    summary="Comment on it; its state stays",
+    operation_id="comment_alarm",
+    openapi_extra=body_schema(ServiceRequest, WHY, required=True),
+)
+async def comment_alarm(state: Shared, alarm: AlarmId, request: OutOfService) -> AlarmView:
+    desk = state.service.plant.alarms
+    return await _done(state, functools.partial(desk.comment, alarm, by=request.by, reason=request.reason))
 
 
 async def _done(state: AppState, deed: Callable[[], Alarm]) -> AlarmView:

@@ -31,6 +31,20 @@ Moment = Annotated[float | None, Query(ge=0.0, le=1e11, allow_inf_nan=False, des
 HEAD = ("id", *COLUMNS)
 
 
+class CertificateView(BaseModel):
+    """What judged cases say about readings of this kind and regime; or `none` with the reason, and nothing else."""
+
+    at_most: Annotated[
+        float | None, Field(description="of sure readings of this kind here, at most this share is wrong")
+    ] = None
+    assurance: Annotated[float | None, Field(description="probability with which that bound holds")] = None
+    cases: Annotated[int | None, Field(description="independent judged cases")] = None
+    wrong: Annotated[int | None, Field(description="how many of these were wrong")] = None
+    source: Annotated[str | None, Field(description="`simulation`, or `site`: answers of people")] = None
+    id: Annotated[str | None, Field(description="of the file of the certificate")] = None
+    none: Annotated[str | None, Field(description="why there is no certificate")] = None
+
+
 class HistoryReading(BaseModel):
     """A stored reading. `quality` is `valid` or `invalid`; an invalid one has a `cause` and no value, state or text.
 
@@ -60,6 +74,7 @@ class HistoryReading(BaseModel):
     crop_url: str | None
     sure: Annotated[bool, Field(description="it was given, is above the cell's sure line, and nothing contradicts it")]
     doubt: Annotated[str, Field(description="why a person should look at it; empty for a sure one")]
+    certificate: Annotated[CertificateView | None, Field(description="null for a reading of an older version")]
     answered: Annotated[
         str | None, Field(description="JSON: what a person has said about it: by, verdict, reason, at_s")
     ]
@@ -198,7 +213,9 @@ def reading_view(row: Row) -> HistoryReading:
     plain = asdict(row.reading)
     crop = plain.pop("crop")
     url = None if crop is None else f"/v1/history/{row.reading.object}/crops/{crop}"
-    return HistoryReading(id=row.id, crop_url=url, sure=row.reading.is_sure, **plain)
+    said = plain.pop("certificate")
+    certificate = None if said is None else CertificateView.model_validate_json(said)
+    return HistoryReading(id=row.id, crop_url=url, sure=row.reading.is_sure, certificate=certificate, **plain)
 
 
 def _csv(first: Row | None, lines: Iterator[Row]) -> Iterator[str]:

@@ -103,6 +103,7 @@ TABLE: dict[str, Row] = {
     "POST /v1/images": OPERATOR_WRITES,
     "DELETE /v1/images/{image_id}": OPERATOR_WRITES,
     "POST /v1/alarms/{alarm}/acknowledge": OPERATOR,  # alarms are for those who watch, whoever moves the arm
+    "POST /v1/alarms/{alarm}/comment": OPERATOR,
     "POST /v1/alarms/{alarm}/shelve": OPERATOR,
     "POST /v1/alarms/{alarm}/unshelve": OPERATOR,
     "POST /v1/alarms/{alarm}/out-of-service": MAINTAINER,

@@ -12,7 +12,7 @@ import httpx2
 
 from hal.errors import DeviceUnavailable
 from service.client import ApiError, trusting_only
-from service.outlets.source import CellState, Changes, Cursor, Instrument, instruments_of
+from service.outlets.source import CellState, Changes, Cursor, Deed, Instrument, instruments_of
 
 TIMEOUT_S = 10.0
 
@@ -70,9 +70,9 @@ class ApiSource:
         """Return the objects of the panel."""
         return instruments_of(await self._get("/v1/panel"))
 
-    async def acknowledge(self, alarm: str, *, by: str, reason: str) -> None:
-        """Acknowledge an alarm."""
-        path = f"/v1/alarms/{quote(alarm, safe='')}/acknowledge"
+    async def act(self, alarm: str, deed: Deed, *, by: str, reason: str) -> None:
+        """Acknowledge an alarm, or comment on it."""
+        path = f"/v1/alarms/{quote(alarm, safe='')}/{deed}"
         try:
             answer = await self._http.post(path, json={"by": by, "reason": reason}, headers=self._may_acknowledge)
             found = json.loads(answer.content)

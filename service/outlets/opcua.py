@@ -24,7 +24,7 @@ from service.outlets.deliver import Backoff, Sleep, batches
 from service.outlets.opcua_alarms import Conditions
 from service.outlets.opcua_nodes import ObjectNode, add_node
 from service.outlets.opcua_trust import TrustedClients
-from service.outlets.source import Instrument, Memory, Source
+from service.outlets.source import Deed, Instrument, Memory, Source
 
 NAMESPACE = "urn:panelwright:{cell}"
 ENCRYPTED = (
@@ -108,7 +108,7 @@ class OpcuaOutlet:
         for one in instruments:
             self._instruments[one.name] = one
             self._objects[one.name] = await ObjectNode.added(server, root, one)
-        self._conditions = Conditions(server, acknowledge=self._acknowledge if section.acknowledge else None)
+        self._conditions = Conditions(server, act=self._act if section.acknowledge else None)
         await self._conditions.start()
         return server
 
@@ -160,5 +160,5 @@ class OpcuaOutlet:
             if name in self._objects:
                 await self._conditions.tell(alarm, self._objects[name].node, self._instruments[name].priority)
 
-    async def _acknowledge(self, alarm: str, comment: str) -> None:
-        await self._source.acknowledge(alarm, by=f"{self._section.username} (OPC UA)", reason=comment)
+    async def _act(self, alarm: str, deed: Deed, comment: str) -> None:
+        await self._source.act(alarm, deed, by=f"{self._section.username} (OPC UA)", reason=comment)

@@ -1,4 +1,5 @@
-"""The alarms of a cell as conditions of an OPC UA server (OPC 10000-9): events, refresh, and acknowledgement if allowed.
+"""The alarms of a cell as conditions of an OPC UA server (OPC 10000-9): events, refresh, and
+acknowledgement and comments if allowed.
 
 Alarms are AlarmConditionType events of the Server object, and each has an instance of that type at its object, whose parts
 always hold what its newest event said, for clients that read and do not subscribe. `State` is our own part: the state by
@@ -8,6 +9,7 @@ ISA-18.2. asyncua answers ConditionRefresh with the newest event of each conditi
 from __future__ import annotations
 
 import copy
+import functools
 import logging
 import uuid
 from collections.abc import Awaitable, Callable, Mapping
@@ -19,6 +21,7 @@ from asyncua.server.event_generator import EventGenerator
 
 from hal.errors import CellError
 from service.outlets.opcua_nodes import add_node, moment
+from service.outlets.source import Deed
 
 SEVERITY = {"urgent": 900, "high": 700, "medium": 500, "low": 300}
 UNACKNOWLEDGED = ("unacknowledged", "returned-unacknowledged")
@@ -40,7 +43,11 @@ TWO_STATES = {  # the words of OPC 10000-9 for false and true
     "AckedState": ("Unacknowledged", "Acknowledged"), "SuppressedState": ("Unsuppressed", "Suppressed"),
     "OutOfServiceState": ("In Service", "Out of Service"),
 }  # fmt: skip
-Acknowledge = Callable[[str, str], Awaitable[None]]
+METHODS: dict[Deed, int] = {
+    "acknowledge": ua.ObjectIds.AcknowledgeableConditionType_Acknowledge,
+    "comment": ua.ObjectIds.ConditionType_AddComment,
+}
+Act = Callable[[str, Deed, str], Awaitable[None]]
 log = logging.getLogger(__name__)
 
 
@@ -48,23 +55,22 @@ class Conditions:
     """The conditions of a server.
 
     Args:
-        acknowledge: acknowledges an alarm, by its name and with a comment; None if clients may not.
+        act: acknowledges an alarm or comments on it, by its name and with a comment; None if clients may not.
     """
 
-    def __init__(self, server: Server, *, acknowledge: Acknowledge | None) -> None:
-        self._server, self._acknowledge = server, acknowledge
+    def __init__(self, server: Server, *, act: Act | None) -> None:
+        self._server, self._act = server, act
         self._template: Any = None
         self._nodes: dict[str, Node] = {}
         self._told: dict[str, tuple[Any, ...]] = {}
         self._events: dict[str, bytes] = {}
 
     async def start(self) -> None:
-        """Prepare events, and the one method that clients may call."""
+        """Prepare events, and the methods that clients may call."""
         generator = await self._server.get_event_generator(ua.ObjectIds.AlarmConditionType, ua.ObjectIds.Server)
         self._template = _event_of(generator)
-        if self._acknowledge is not None:
-            method = self._server.get_node(ua.ObjectIds.AcknowledgeableConditionType_Acknowledge)
-            self._server.link_method(method, uamethod(self._on_acknowledge))
+        for deed, method in METHODS.items() if self._act is not None else ():
+            self._server.link_method(self._server.get_node(method), uamethod(functools.partial(self._on_call, deed)))
 
     async def tell(self, alarm: Mapping[str, Any], source: Node, priority: str) -> None:
         """Show an alarm at its object, and send an event if it is another than before."""
@@ -129,9 +135,8 @@ class Conditions:
             self._nodes[name] = node = await add_node(source, name.partition(".")[2], path=name, kind=kind)
             await source.add_reference(node, ua.ObjectIds.HasCondition)
             await self._add_parts(node)
-            if self._acknowledge is not None:  # a client may call what it finds here
-                method = ua.NodeId(ua.ObjectIds.AcknowledgeableConditionType_Acknowledge)
-                await node.add_reference(method, ua.ObjectIds.HasComponent)
+            for method in METHODS.values() if self._act is not None else ():  # a client may call what it finds here
+                await node.add_reference(ua.NodeId(method), ua.ObjectIds.HasComponent)
         return self._nodes[name]
 
     async def _add_parts(self, node: Node) -> None:
@@ -155,19 +160,21 @@ class Conditions:
         path, own = f"{part.nodeid.Identifier}.{name}", ua.ObjectIds.PropertyType
         await add_node(part, name, path=path, kind=own, variable=kind, standard=ua.ObjectIds.HasProperty)
 
-    async def _on_acknowledge(self, condition: ua.NodeId, event_id: bytes | None, comment: Any) -> ua.StatusCode:
-        """Answer the method Acknowledge of a condition."""
-        name = str(condition.Identifier)
-        if self._acknowledge is None or name not in self._events:
+    async def _on_call(self, deed: Deed, condition: ua.NodeId, event_id: bytes | None, comment: Any) -> ua.StatusCode:
+        """Answer the method Acknowledge or AddComment of a condition."""
+        name, said = str(condition.Identifier), (comment.Text or "") if comment is not None else ""
+        if self._act is None or name not in self._events:
             return ua.StatusCode(ua.StatusCodes.BadNodeIdUnknown)
-        if event_id != self._events[name]:  # of an older state, which is not what the client means to acknowledge
+        if event_id != self._events[name]:  # of an older state, which is not what the client means
             return ua.StatusCode(ua.StatusCodes.BadEventIdUnknown)
-        if self._told[name][0] not in UNACKNOWLEDGED:
+        if deed == "acknowledge" and self._told[name][0] not in UNACKNOWLEDGED:
             return ua.StatusCode(ua.StatusCodes.BadConditionBranchAlreadyAcked)
+        if deed == "comment" and not said:
+            return ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
         try:
-            await self._acknowledge(name, (comment.Text or "") if comment is not None else "")
+            await self._act(name, deed, said)
         except CellError as error:
-            log.warning("OPC UA: %s is not acknowledged: %s", name, error.what)
+            log.warning("OPC UA: %s of %s is refused: %s", deed, name, error.what)
             return ua.StatusCode(ua.StatusCodes.BadUserAccessDenied)
         return ua.StatusCode(ua.StatusCodes.Good)
 

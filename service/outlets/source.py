@@ -6,9 +6,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from hal.atomic_write import write_atomically
+
+Deed = Literal["acknowledge", "comment"]  # what an outlet may do about an alarm, if the cell file allows it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,8 +98,8 @@ class Source(Protocol):
         """Return the objects of the panel; raises as `changes`."""
         ...
 
-    async def acknowledge(self, alarm: str, *, by: str, reason: str) -> None:
-        """Acknowledge an alarm for somebody.
+    async def act(self, alarm: str, deed: Deed, *, by: str, reason: str) -> None:
+        """Acknowledge an alarm for somebody, or comment on it.
 
         Raises:
             CellError: the service does not answer, or refuses.

@@ -42,6 +42,18 @@ def test_an_alarm_is_listed_acknowledged_and_recorded(client: httpx2.Client, ser
     assert names == {LAMP, "pump_lamp.refused"}
 
 
+def test_a_comment_is_recorded_and_leaves_the_state(client: httpx2.Client, served: Panelwright) -> None:
+    said = client.post(f"/v1/alarms/{LAMP}/comment", json={"by": "alice", "reason": "a lamp is ordered"}).json()
+    assert (said["state"], said["is_active"], said["by"]) == ("unacknowledged", True, "alice")
+    newest = served.service.journal.records(kinds=("alarm",))[-1].data
+    assert (newest["before"], newest["state"], newest["reason"]) == (
+        "unacknowledged",
+        "unacknowledged",
+        "a lamp is ordered",
+    )
+    assert client.post(f"/v1/alarms/{LAMP}/comment", json={"by": "alice", "reason": ""}).status_code == 422
+
+
 def test_an_alarm_is_shelved_and_taken_out_of_service(client: httpx2.Client) -> None:
     body = {"by": "alice", "reason": "repair"}
     shelved = client.post(f"/v1/alarms/{LAMP}/shelve", json={**body, "until_s": time.time() + 60}).json()
@@ -80,3 +92,4 @@ def test_the_command_lists_acknowledges_and_shelves(served: Panelwright) -> None
     assert "shelved" in run("--all")
     assert "is unacknowledged" in run("unshelve", LAMP)
     assert "is acknowledged" in run("acknowledge", LAMP, "--by", "alice")
+    assert "is acknowledged" in run("comment", LAMP, "--reason", "a lamp is ordered", "--by", "alice")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -49,6 +50,24 @@ def test_a_page_leads_to_the_next_one(filled: Panelwright, client: httpx2.Client
     picture = client.get(first["crop_url"])
     assert (picture.content, picture.headers["content-type"]) == (CROP, "image/png")
     assert client.get(first["crop_url"].replace("/crops/", "/crops/0")[:-1]).status_code == 404
+
+
+def test_a_reading_says_whether_it_is_sure_and_what_its_certificate_bounds(
+    served: Panelwright, client: httpx2.Client
+) -> None:
+    said = {"at_most": 0.01, "assurance": 0.95, "cases": 299, "wrong": 0, "source": "simulation", "id": "a1"}
+    readings = [
+        reading(0, 1.0, object="certified", certificate=json.dumps(said)),
+        reading(1, 2.0, object="certified", certificate=json.dumps({"none": "it is not sure"}), doubt="it is weak"),
+    ]
+    served.service.plant.history.add(readings)
+    sure, weak = client.get("/v1/history/certified").json()["readings"]
+    assert (sure["sure"], sure["certificate"]) == (True, {**said, "none": None})
+    assert (weak["sure"], weak["certificate"]["none"], weak["certificate"]["at_most"]) == (
+        False,
+        "it is not sure",
+        None,
+    )
 
 
 def test_a_trend_is_down_sampled_and_counts_what_was_refused(filled: Panelwright, client: httpx2.Client) -> None:

@@ -6,7 +6,7 @@ import asyncio
 from typing import Any
 
 from hal.errors import DeviceUnavailable
-from service.outlets.source import CellState, Changes, Cursor, Instrument, instruments_of
+from service.outlets.source import CellState, Changes, Cursor, Deed, Instrument, instruments_of
 
 READING: dict[str, Any] = {
     "id": 0, "object": "pressure", "kind": "gauge", "utc_s": 1.79e9, "quality": "valid", "cause": "", "value": 1.0, "unit": "bar",
@@ -34,7 +34,7 @@ class FakeSource:
         self.alarms: list[dict[str, Any]] = []
         self.is_silent, self.batch = False, batch
         self.changed = asyncio.Event()
-        self.acknowledged: list[tuple[str, str, str]] = []
+        self.acts: list[tuple[str, Deed, str, str]] = []
 
     def reads(self, value: float | None, **given: Any) -> None:
         """Add a reading; None is a refused one."""
@@ -77,9 +77,10 @@ class FakeSource:
             raise DeviceUnavailable("the service does not answer", hint="wait")
         return instruments_of(PANEL)
 
-    async def acknowledge(self, alarm: str, *, by: str, reason: str) -> None:
-        self.acknowledged.append((alarm, by, reason))
-        self.alarms_change(id=alarm, state="acknowledged", by=by, reason=reason)
+    async def act(self, alarm: str, deed: Deed, *, by: str, reason: str) -> None:
+        self.acts.append((alarm, deed, by, reason))
+        state = "acknowledged" if deed == "acknowledge" else self.alarms[-1]["state"]
+        self.alarms_change(id=alarm, state=state, by=by, reason=reason, changed_s=ALARM["changed_s"] + len(self.acts))
 
 
 async def no_pause(_seconds: float) -> None:

@@ -1,4 +1,5 @@
-// A client of another make (node-opcua): reads a value with its status, time, unit and range, waits for an alarm, acknowledges it.
+// A client of another make (node-opcua): reads a value with its status, time, unit and range, waits for an alarm, acknowledges
+// it and comments on it.
 // Arguments: address, user, password. Prints "listening" when it waits for the alarm, then one line of JSON.
 "use strict";
 const say = (line) => process.stdout.write(`${line}\n`);
@@ -50,6 +51,8 @@ async function main() {
     const status = await session.acknowledgeCondition(`ns=${index};s=${name}`, eventId, "seen by node-opcua");
     if (!status.isGood()) throw new Error(`Acknowledge: ${status.toString()}`);
     const after = await next();
+    const commented = await session.addCommentCondition(`ns=${index};s=${name}`, after[0], "said by node-opcua");
+    if (!commented.isGood()) throw new Error(`AddComment: ${commented.toString()}`);
     say(JSON.stringify({
         value: { value: value.value.value, status: value.statusCode.name, at: value.sourceTimestamp.getTime() },
         refused: { value: refused.value.value ?? null, status: refused.statusCode.name },

@@ -200,18 +200,32 @@ def test_alarms_are_conditions_that_can_be_refreshed_and_acknowledged_only_if_th
             with pytest.raises(ua.UaStatusCodeError) as caught:
                 await condition.call_method(acknowledge, b"of another state", comment)
             assert caught.value.code == ua.StatusCodes.BadEventIdUnknown
-            assert source.acknowledged == []
+            assert source.acts == []
             await condition.call_method(acknowledge, risen.EventId, comment)
-            assert source.acknowledged == [("pressure.high", "scada (OPC UA)", "on my way")]
-            assert shown(await events.next()) == ("pressure.high", True, True, True, 700)
+            assert source.acts == [("pressure.high", "acknowledge", "scada (OPC UA)", "on my way")]
+            seen = await events.next()
+            assert shown(seen) == ("pressure.high", True, True, True, 700)
+            add_comment = ua.NodeId(ua.ObjectIds.ConditionType_AddComment)
+            with pytest.raises(ua.UaStatusCodeError) as caught:
+                await condition.call_method(add_comment, risen.EventId, ua.LocalizedText("of an older state"))
+            assert caught.value.code == ua.StatusCodes.BadEventIdUnknown
+            with pytest.raises(ua.UaStatusCodeError) as caught:
+                await condition.call_method(add_comment, seen.EventId, ua.LocalizedText(""))
+            assert caught.value.code == ua.StatusCodes.BadInvalidArgument
+            await condition.call_method(add_comment, seen.EventId, ua.LocalizedText("the valve sticks"))
+            assert source.acts[1:] == [("pressure.high", "comment", "scada (OPC UA)", "the valve sticks")]
+            commented = await events.next()
+            assert shown(commented) == ("pressure.high", True, True, True, 700)
+            assert (commented.Comment.Text, commented.ClientUserId) == ("the valve sticks", "scada (OPC UA)")
             source.alarms_change(state="normal", is_active=False, changed_s=AT_S + 60)
             assert shown(await events.next()) == ("pressure.high", False, True, False, 700)
-        assert len(source.acknowledged) == 1
+        assert len(source.acts) == 2
         async with serving(source) as url, connected(url) as client:
             await until(client, "pressure.high.State", lambda found: found.Value.Value == "normal")
             condition = await node_of(client, "pressure.high")
-            with pytest.raises(ua.UaStatusCodeError):
-                await condition.call_method(acknowledge, b"x", comment)
+            for method in (acknowledge, add_comment):
+                with pytest.raises(ua.UaStatusCodeError):
+                    await condition.call_method(method, b"x", comment)
 
     asyncio.run(story())
 
@@ -381,7 +395,10 @@ def test_node_opcua_reads_the_same_and_gets_the_alarm(tmp_path: Path) -> None:
                 source.alarms_change()
                 out, errors = await other.communicate()
             assert other.returncode == 0, errors.decode()
-            assert source.acknowledged == [("pressure.high", "scada (OPC UA)", "seen by node-opcua")]
+            assert source.acts == [
+                ("pressure.high", "acknowledge", "scada (OPC UA)", "seen by node-opcua"),
+                ("pressure.high", "comment", "scada (OPC UA)", "said by node-opcua"),
+            ]
             return dict(json.loads(out))
 
     told = asyncio.run(story())

@@ -317,7 +317,7 @@ def test_the_feed_streams_what_comes_and_goes_on_after_the_last_event(
     assert client.get("/v1/feed/events", headers={"Last-Event-ID": "yesterday"}).status_code == 422
 
 
-def test_an_outlet_knows_the_panel_and_acknowledges_what_the_service_allows(served: Panelwright) -> None:
+def test_an_outlet_knows_the_panel_and_acknowledges_and_comments_as_the_service_allows(served: Panelwright) -> None:
     plant = served.service.plant
     lamp = {"object": "pump_lamp", "kind": "lamp", "unit": ""}
     plant.alarms.take([reading(0, None, state="off", **lamp)])
@@ -325,14 +325,15 @@ def test_an_outlet_knows_the_panel_and_acknowledges_what_the_service_allows(serv
     async def story() -> None:
         source = ApiSource(served.url)
         assert {one.name: one.kind for one in await source.panel()}["pump_lamp"] == "lamp"
-        await source.acknowledge("pump_lamp.state", by="scada (OPC UA)", reason="on my way")
+        await source.act("pump_lamp.state", "acknowledge", by="scada (OPC UA)", reason="on my way")
         with pytest.raises(ApiError, match="cannot be acknowledged"):
-            await source.acknowledge("pump_lamp.state", by="scada (OPC UA)", reason="again")
+            await source.act("pump_lamp.state", "acknowledge", by="scada (OPC UA)", reason="again")
+        await source.act("pump_lamp.state", "comment", by="scada (OPC UA)", reason="a lamp is ordered")
         await source.close()
 
     asyncio.run(story())
     alarm = plant.alarms.get("pump_lamp.state")
-    assert (alarm.state, alarm.by, alarm.reason) == ("acknowledged", "scada (OPC UA)", "on my way")
+    assert (alarm.state, alarm.by, alarm.reason) == ("acknowledged", "scada (OPC UA)", "a lamp is ordered")
     plant.alarms.take([reading(0, None, state="on", **lamp)])
 
 

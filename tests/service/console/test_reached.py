@@ -15,6 +15,8 @@ from service.access.keys import Role
 from service.exposure import Exposure
 from tests.service.browser import NEEDS_CHROMIUM
 from tests.service.conftest import WriteCell
+from tests.service.console import nginx
+from tests.service.console.nginx import Nginx
 from tests.service.console.served import Cell, until
 from tests.service.console.tls_proxy import TlsProxy
 from tests.service.test_exposure import certificate
@@ -25,8 +27,11 @@ KEYS = {"bob": Role.OBSERVER, "carol": Role.OPERATOR}
 
 @pytest.fixture
 def proxied(write_cell: WriteCell, tmp_path: Path) -> Iterator[tuple[Cell, str]]:
-    """Yield a cell behind a proxy that ends TLS, and the address of its console there."""
-    proxy = TlsProxy(*certificate(tmp_path))
+    """Yield a cell behind a proxy that ends TLS, and the address of its console there.
+
+    The proxy is nginx with the example of the documentation, and a small one of the tests where nginx is not installed.
+    """
+    proxy = (Nginx if nginx.PROGRAM.exists() else TlsProxy)(*certificate(tmp_path))
     runs = tmp_path / "runs"
     exposure = Exposure(names=(f"localhost:{proxy.port}",), behind_proxy=True, unix_socket=tmp_path / "socket")
     cell = Cell(write_cell, runs, keys=KEYS, exposure=exposure)

@@ -18,14 +18,14 @@ HOUR_S = 3600.0
 SHELVED_FOR_H = (1, 8, 24, 7 * 24)
 LOOKS = {"urgent": "bad", "high": "bad", "medium": "warn", "low": ""}
 DEEDS = {
-    "unacknowledged": ("acknowledge", "shelve", "out-of-service"),
-    "returned-unacknowledged": ("acknowledge", "shelve", "out-of-service"),
-    "acknowledged": ("shelve", "out-of-service"),
-    "shelved": ("unshelve", "out-of-service"),
-    "out-of-service": ("in-service",),
+    "unacknowledged": ("acknowledge", "comment", "shelve", "out-of-service"),
+    "returned-unacknowledged": ("acknowledge", "comment", "shelve", "out-of-service"),
+    "acknowledged": ("comment", "shelve", "out-of-service"),
+    "shelved": ("unshelve", "comment", "out-of-service"),
+    "out-of-service": ("in-service", "comment"),
 }
 MAINTAINERS = ("out-of-service", "in-service")
-ASKS_WHY = ("shelve", "out-of-service")
+ASKS_WHY = ("comment", "shelve", "out-of-service")
 
 
 def install(place: Place) -> None:

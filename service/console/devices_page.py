@@ -9,6 +9,7 @@ from nicegui import ui
 
 from hal.errors import CellError
 from service.access.keys import Role
+from service.console.device_form import DeviceDialog
 from service.console.mirror import Mirror
 from service.console.page_frame import Place, attempt, live, page_frame, picks, table
 from service.console.service_client import QUICK_S
@@ -26,7 +27,7 @@ def install(place: Place) -> None:
     @ui.page("/devices", title=f"{say('nav.devices')} · {say('title')}")
     def devices_page() -> None:
         mirror = place.mirror
-        values = _Values(mirror)
+        values, dialog = _Values(mirror), DeviceDialog(mirror)
 
         async def connect(name: str) -> None:
             if await attempt(lambda: mirror.client.post(f"/v1/devices/{name}/connect")) is not None:
@@ -36,7 +37,7 @@ def install(place: Place) -> None:
         with page_frame(place, "devices"), ui.element("section").classes("card"):
             ui.html(say("devices.heading"), sanitize=False, tag="h2")
             listed = ui.html("", sanitize=False).classes("stack")
-            live(picks(listed, connect, what="connect"), values.table)
+            live(picks(picks(listed, connect, what="connect"), dialog.show, what="swap"), values.table)
             live(
                 ui.html("", sanitize=False, tag="p").classes("quiet"),
                 lambda: say("devices.sim") if is_sim(mirror) else "",
@@ -87,6 +88,9 @@ class _Values:
         again = "" if health["connected"] or not self._mirror.may(Role.OPERATOR) else (
             f'<button type="button" class="plain" data-connect="{name}">{say("device.connect")}</button>'
         )  # fmt: skip
+        if self._mirror.may(Role.MAINTAINER):
+            label = attribute(say("device.swap.heading", name=name))
+            again += f' <button type="button" class="plain" data-swap="{name}" aria-label="{label}">{say("device.swap")}</button>'
         value = "–" if reading is None else shown_value(device["kind"], reading["value"])
         if device["kind"] in PICTURES:
             value = say("device.picture")

@@ -52,7 +52,7 @@ class LogInFirst:
 def install_log_in(app: FastAPI, people: People) -> None:
     """Add the log-in page, and the call by which it logs a browser in or out."""
     for path in LOGIN_FILES:
-        app.add_api_route(path, _sender(SERVICE_WEB / path[1:]), methods=["GET"])
+        app.add_api_route(path, sender(SERVICE_WEB / path[1:]), methods=["GET"])
 
     @app.post("/v1/session")
     async def log_in(request: Request) -> Response:
@@ -63,7 +63,8 @@ def install_log_in(app: FastAPI, people: People) -> None:
         return await _passed_on(people, request, None)
 
 
-def _sender(file: Path) -> Callable[[], FileResponse]:
+def sender(file: Path) -> Callable[[], FileResponse]:
+    """Return a route that sends a file."""
     return lambda: FileResponse(file)
 
 

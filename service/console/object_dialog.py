@@ -15,6 +15,8 @@ from service.console.limits_form import LimitsForm
 from service.console.mirror import Mirror
 from service.console.object_facts import facts_html, history_html
 from service.console.page_frame import attempt, button
+from service.console.service_form import ServiceForm
+from service.console.teach_page import PATH as TEACH
 from service.console.texts import say, word
 from service.console.values import attribute, label_of, limits_for_people, number, shown, target_for_api
 
@@ -37,6 +39,7 @@ class ObjectDialog:
             self._work = ui.element("div")
             self._told = ui.html("", sanitize=False, tag="p").props("role=status")
             self._limits = LimitsForm(mirror)
+            self._service = ServiceForm(mirror)
             self._history = ui.html("", sanitize=False)
             with ui.element("div").classes("row end"):
                 button(say("object.close"), self._dialog.close, look="plain")
@@ -60,6 +63,7 @@ class ObjectDialog:
         self._offer()
         self._limits.show(one)
         self._dialog.open()
+        await self._service.show(one)
         await self._load_history()
 
     def _renew(self, *, even_if_closed: bool = False) -> None:
@@ -100,6 +104,8 @@ class ObjectDialog:
                 button(say("object.read"), self._read)
                 if one.goal is not None and not one.forbidden:
                     self._offer_targets(one, one.goal)
+                if self._mirror.may(Role.MAINTAINER):
+                    button(say("object.teach"), partial(ui.navigate.to, TEACH), look="plain")
             _line(say("object.read_says", label=label_of(one)))
             if one.goal is None or one.forbidden:
                 _line(say("object.read_only" if one.goal is None else "object.forbidden", label=label_of(one)))

@@ -6,6 +6,7 @@ from typing import Any
 
 from hal.panel import PanelObject
 from service.console.page_frame import clock
+from service.console.panel_drawing import is_off
 from service.console.texts import say, word
 from service.console.values import Reading, age, attribute, confidence, label_of, number, shown, sigma
 
@@ -25,15 +26,39 @@ def facts_html(one: PanelObject, reading: Reading | None, alarm: dict[str, Any] 
     if reading is not None:
         if reading["quality"] != "valid":
             parts.append(f'<p class="warn">{attribute(say("object.refused", cause=reading["cause"]))}</p>')
+        elif told := certified(reading):
+            parts.append(f'<p class="quiet">{attribute(told)}</p>')
         where = say(
             "object.from", verb=word("verb", reading["verb"]), phase=reading["phase"] or clock(reading["utc_s"])
         )
         parts.append(f'<p class="quiet">{attribute(where)}</p>')
     if alarm is not None:
-        key, look = ("object.alarm", "bad") if alarm["is_active"] else ("object.alarm_over", "warn")
-        told = say(key, says=alarm["says"], what_to_do=alarm["what_to_do"])
+        look, told = alarm_line(alarm)
         parts.append(f'<p class="{look}">{attribute(told)}</p>')
     return "".join(parts)
+
+
+def certified(reading: Reading) -> str:
+    """Return whether a reading is sure, and what its certificate says or why it has none."""
+    if not reading["sure"]:
+        return say("object.unsure", why=reading["doubt"])
+    said = reading["certificate"]
+    if said is None or said["none"] is not None:
+        return say("object.sure", why="" if said is None else said["none"]).rstrip()
+    share, assurance = f"{100 * said['at_most']:.2g} %", f"{100 * said['assurance']:.0f} %"
+    counts = {key: said[key] for key in ("cases", "wrong", "source")}
+    return say("object.certified", share=share, assurance=assurance, **counts)
+
+
+def alarm_line(alarm: dict[str, Any]) -> tuple[str, str]:
+    """Return an alarm in words, with how urgent it looks: `bad` only while it calls for somebody."""
+    if is_off(alarm):
+        until = f" {say('alarms.until', when=clock(alarm['shelved_until_s']))}" if alarm["shelved_until_s"] else ""
+        holds = alarm["says"] if alarm["is_active"] else say("alarms.gone")
+        return "quiet", say("object.alarm_off", state=f"{word('alarm', alarm['state'])}{until}", says=holds)
+    if alarm["is_active"]:
+        return "bad", say("object.alarm", says=alarm["says"], what_to_do=alarm["what_to_do"]).rstrip()
+    return "warn", say("object.alarm_over", says=alarm["says"])
 
 
 def history_html(one: PanelObject, readings: list[Reading]) -> str:

@@ -52,7 +52,7 @@ def _object(one: PanelObject, reading: Reading | None, alarm: Mapping[str, Any] 
     half_w, half_h = (size * PX_PER_M for size in one.half_footprint_m)
     label, value = label_of(one), shown(one, reading)
     seen = "–" if reading is None else value  # the list below says in words that nobody has read it
-    mark = "var(--bad)" if alarm is not None and alarm["is_active"] else "var(--ink)"
+    mark = "var(--bad)" if alarm is not None and alarm["is_active"] and not is_off(alarm) else "var(--ink)"
     refused = reading is not None and reading["quality"] != "valid"
     words = "var(--warn)" if refused else mark
     row = f'data-row="{reading["utc_s"]:.1f}"' if reading is not None else ""
@@ -67,9 +67,36 @@ def _object(one: PanelObject, reading: Reading | None, alarm: Mapping[str, Any] 
     return (
         f'<g transform="translate({x:.1f} {y:.1f})" data-object="{one.name}" {row} role="button" tabindex="0" '
         f'aria-label="{attribute(say("open", label=label, value=value))}">'
-        f"{_foot(one, half_w, half_h, mark)}{_pointer(one, reading, half_w, half_h, mark)}{name}"
+        f"{_foot(one, half_w, half_h, mark)}{_limits(one, alarm, half_w, half_h)}"
+        f"{_pointer(one, reading, half_w, half_h, mark)}{name}"
         f"{text.format(y=below, style=style, words=attribute(seen))}</g>"
     )
+
+
+def is_off(alarm: Mapping[str, Any]) -> bool:
+    """Return whether an alarm calls for nobody, whatever its condition."""
+    return alarm["state"] in ("shelved", "out-of-service")
+
+
+def _limits(one: PanelObject, alarm: Mapping[str, Any] | None, half_w: float, half_h: float) -> str:
+    """Return a line across the scale at each limit; that of the alarm that calls is marked."""
+    scale = getattr(one, "scale", None)
+    if one.limits is None or scale is None:
+        return ""
+    parts = []
+    for kind, limit in one.limits.given.items():
+        calls = alarm is not None and alarm["kind"] == kind and alarm["is_active"] and not is_off(alarm)
+        style = f'class="limit" stroke="var({"--bad" if calls else "--warn"})" stroke-width="{5 if calls else 3}"'
+        place = float(scale.place_of(limit))
+        if one.places_are_lengths:
+            turn, along = float(getattr(one, "angle_rad", 0.0)), place * PX_PER_M
+            x, y, across = along * math.cos(turn), -along * math.sin(turn), (math.sin(turn) * 12, math.cos(turn) * 12)
+            ends = (x - across[0], y - across[1], x + across[0], y + across[1])
+        else:
+            x, y = math.sin(place), -math.cos(place)
+            ends = (0.86 * half_w * x, 0.86 * half_h * y, half_w * x, half_h * y)
+        parts.append(f'<path d="M{ends[0]:.1f} {ends[1]:.1f}L{ends[2]:.1f} {ends[3]:.1f}" {style}/>')
+    return "".join(parts)
 
 
 def _foot(one: PanelObject, half_w: float, half_h: float, mark: str) -> str:

@@ -11,6 +11,7 @@ from hal.panel import PanelObject
 from service.console.mirror import Mirror
 from service.console.mission_words import is_plan, name_of
 from service.console.object_dialog import ObjectDialog
+from service.console.object_facts import alarm_line
 from service.console.page_frame import Place, clock, live, page_frame, picks, table
 from service.console.panel_drawing import overlay_svg, panel_svg
 from service.console.poses import camera_from_panel, has_moved, lens_of
@@ -65,8 +66,8 @@ def _row(one: PanelObject, reading: Reading | None, alarm: dict[str, Any] | None
     row = f' data-row="{reading["utc_s"]:.1f}"' if reading is not None else ""
     says = ""
     if alarm is not None:
-        told = alarm["says"] if alarm["is_active"] else f"{word('alarm', alarm['state'])}: {alarm['says']}"
-        says = f'<span class="{"bad" if alarm["is_active"] else "warn"}">{attribute(told)}</span>'
+        look, told = alarm_line(alarm)
+        says = f'<span class="{look}">{attribute(told)}</span>'
     return (
         f'<tr{row}><td><button type="button" class="name" data-object="{one.name}">{attribute(label_of(one))}</button></td>'
         f'<td><b>{attribute(value)}</b> <span class="quiet">{attribute(why)}</span></td>'

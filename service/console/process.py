@@ -27,6 +27,7 @@ from service.console import (
     review_page,
     rounds_page,
     setup_page,
+    teach_page,
 )
 from service.console.log_in import LogInFirst, install_log_in
 from service.console.own_page import LOCAL, OwnPageOnly, Reach
@@ -50,6 +51,7 @@ PAGES = (
     devices_page,
     setup_page,
     cell_page,
+    teach_page,
 )
 
 
@@ -75,8 +77,8 @@ def create_app(
         await people.close()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
+    install_log_in(app, people)  # first, because the relay takes all that is left of /v1
     install_relay(app, people, is_local=reach.is_local)
-    install_log_in(app, people)
     nicegui_app.add_static_files("/web", WEB)
     place = Place(port=port, stop_port=stop_port)
     for page in PAGES:
@@ -91,7 +93,9 @@ def create_app(
         reconnect_timeout=5.0,
         language="en-US",
     )
-    app.add_middleware(LogInFirst, people=people, pages=frozenset([*PATHS.values(), mission_editor.PATH]))
+    app.add_middleware(
+        LogInFirst, people=people, pages=frozenset([*PATHS.values(), mission_editor.PATH, teach_page.PATH])
+    )
     app.add_middleware(OwnPageOnly, reach=reach)
     return app
 

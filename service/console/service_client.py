@@ -83,15 +83,28 @@ class ServiceClient:
         return answer.content
 
     async def answer(
-        self, method: str, path: str, body: Any = None, *, timeout_s: float = TIMEOUT_S
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        *,
+        content: bytes | None = None,
+        media: str | None = None,
+        timeout_s: float = TIMEOUT_S,
     ) -> httpx2.Response:
         """Return an answer as it came, also a problem.
+
+        Args:
+            content, media: a body as it is, with its media type, in place of `body`.
 
         Raises:
             DeviceUnavailable: the service does not answer.
         """
+        headers = self._headers if media is None else {**self._headers, "Content-Type": media}
         try:
-            return await self._http.request(method, path, json=body, timeout=timeout_s, headers=self._headers)
+            return await self._http.request(
+                method, path, json=body, content=content or None, timeout=timeout_s, headers=headers
+            )
         except httpx2.RequestError as error:
             raise DeviceUnavailable(say("service.silent"), hint=say("service.silent.hint")) from error
 

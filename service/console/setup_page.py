@@ -11,10 +11,9 @@ from nicegui import ui
 from service.access.keys import Role
 from service.console.mirror import Mirror
 from service.console.page_frame import Place, attempt, live, page_frame, picks
+from service.console.teach_page import PATH as TEACH
 from service.console.texts import say
 from service.console.values import attribute
-
-TEACH = "/teach.html"  # a page of the service itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,7 +129,8 @@ def _records(mirror: Mirror) -> Iterator[Check]:
         what=say("setup.objects"),
         fix=say("setup.objects.fix") if lacks_objects else "",
         label=say("setup.objects.do"),
-        path=f"page:{mirror.client.url}{TEACH}",
+        again=say("setup.objects.again"),
+        path=f"page:{TEACH}",
     )
     records = mirror.said("calibrations", {"calibrations": []})["calibrations"]
     bare = [one["device"] for one in records if one["mount"] is None]

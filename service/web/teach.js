@@ -171,7 +171,7 @@ function choose(mode) {
   enable();
 }
 
-startStop(insist("/v1/info").then((info) => info.stop_url));
+if ($("#stop")) startStop(insist("/v1/info").then((info) => info.stop_url)); // the console has a stop of its own
 const panel = startPanel({ clicks, pointAt, save: savePanel, attempt });
 const learn = startLearn({ chosenImage, attempt, tell, show: showLearned });
 onClicks(look);

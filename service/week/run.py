@@ -121,7 +121,9 @@ def _open_valve(panelwright: Panelwright) -> None:
     stop = client.get("/v1/stop")
     if stop["is_latched"]:  # as in `demo`, whoever runs it states that the cell is clear
         client.post("/v1/stop/reset", {"seen_count": stop["count"]})
-    task = client.post("/v1/manipulate?wait_s=30", {"object": VALVE, "state": "open"})
+    task = client.post("/v1/manipulate", {"object": VALVE, "state": "open"})
+    for _ in client.events(task["id"]):  # a task that nobody follows is cancelled, however busy the machine is
+        pass
     done = panelwright.service.tasks.get(task["id"])
     done.wait(ROUND_PATIENCE_S)
     if done.problem is not None:

@@ -54,6 +54,7 @@
     box.dataset.latched = latched;
     if (line.textContent !== text) line.textContent = text;
     reset.hidden = pending > 0 || latched !== "yes";
+    document.dispatchEvent(new CustomEvent("latch"));
   }
 
   document.querySelector("#stop-button").addEventListener("click", stop);

@@ -7,12 +7,15 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from service.access.keys import Role
 from tests.service.browser import NEEDS_CHROMIUM
 from tests.service.conftest import WriteCell
 from tests.service.console.served import Cell, leave_mission, until
+from tests.service.console.test_five_tasks import DIALOG
 from tests.service.waiting import eventually
 
 pytestmark = NEEDS_CHROMIUM
@@ -27,6 +30,7 @@ PAGES = (
     "/setup",
     "/cell",
     "/mission-editor",
+    "/teach",
 )
 
 
@@ -36,6 +40,80 @@ def test_the_panel_shows_and_a_new_reading_appears_by_itself(page: Any, cell: Ce
     until(page, "document.querySelector('[data-object=setpoint] .value').textContent === '41.5 %'")
     until(page, "document.querySelector('tr time').textContent.endsWith(' s')")
     until(page, "document.querySelector('img[data-source]').naturalWidth === 64")
+
+
+def test_the_alarms_of_an_object_are_taken_out_of_service_and_put_back(page: Any, cell: Cell) -> None:
+    desk = cell.service.service.plant.alarms
+    cell.record(95.0)
+    page.goto(cell.url)
+    page.click("g[data-object=setpoint]")
+    page.click(".dialog button:text-is('Out of service …')")
+    page.click(".dialog button:text-is('Take out of service')")
+    until(page, f"{DIALOG}.includes('Give your name first')")
+    assert desk.get("setpoint.high").state == "unacknowledged"
+    page.fill(".dialog input[aria-label='Your name, for the record']", "alice")
+    page.fill(".dialog input[aria-label=Reason]", "it is repaired")
+    page.click(".dialog button:text-is('Take out of service')")
+    until(page, f"{DIALOG}.includes('Its alarms are out of service (alice: it is repaired)')")
+    assert {one.state for one in desk.all() if one.object == "setpoint"} == {"out-of-service"}
+    until(page, f"{DIALOG}.includes('Alarm out of service: setpoint shows 95 %, above high 90')")
+    until(page, "document.querySelector('nav .count') === null")
+    page.click(".dialog button:text-is('Put back in service')")
+    page.fill(".dialog input[aria-label='Your name, for the record']", "alice")
+    page.fill(".dialog input[aria-label=Reason]", "it is new")
+    page.click(".dialog button:text-is('Put back in service')")
+    until(page, "document.querySelector('nav .count').textContent === '1'")
+    cell.record(50.0)
+    desk.acknowledge("setpoint.high", by="cleaner")
+
+
+def test_a_limit_is_a_line_on_the_scale_that_shows_its_alarm(page: Any, cell: Cell) -> None:
+    page.goto(cell.url)
+    line = "document.querySelector('[data-object=setpoint] .limit').getAttribute('stroke')"
+    cell.record(50.0)
+    until(page, f"{line} === 'var(--warn)'")
+    cell.record(95.0)
+    until(page, f"{line} === 'var(--bad)'")
+    cell.record(50.0)
+    cell.service.service.plant.alarms.acknowledge("setpoint.high", by="cleaner")
+
+
+def test_a_device_gets_other_options_and_keeps_its_own_when_they_do_not_work(page: Any, cell: Cell) -> None:
+    cell.trouble.write_text("away")
+    page.goto(f"{cell.url}/devices")
+    page.click("[data-swap=panel_lights]")
+    until(page, f"document.querySelector('.dialog textarea').value.includes('{cell.trouble}')")
+    own = page.input_value(".dialog textarea")
+    page.fill(".dialog textarea", "trouble = none")
+    page.click(".dialog button:text-is('Change and connect')")
+    until(page, f"{DIALOG}.includes('The options are not valid')")
+    page.fill(".dialog textarea", own)
+    page.click(".dialog button:text-is('Change and connect')")
+    until(page, f"{DIALOG}.includes('The present driver is kept')")
+    cell.trouble.write_text("")
+    page.click(".dialog button:text-is('Change and connect')")
+    until(page, "!document.querySelector('.dialog')?.checkVisibility()")
+    until(page, "document.querySelector('.banner').textContent === ''")
+
+
+def test_the_console_teaches_by_clicks(page: Any, cell: Cell, tmp_path: Path) -> None:
+    picture = np.full((480, 640, 3), 90, np.uint8)
+    cv2.circle(picture, (320, 240), 60, (20, 20, 220), -1)
+    cv2.imwrite(str(tmp_path / "panel.png"), picture)
+    page.goto(f"{cell.url}/setup")
+    page.click("button:text-is('Teach more')")
+    page.wait_for_url("**/teach")
+    until(page, "document.querySelector('#known-line').textContent.includes('kinds')")
+    page.set_input_files("#file", str(tmp_path / "panel.png"))
+    until(page, "document.querySelector('#picture').naturalWidth === 640")
+    page.click("#picture")
+    until(page, "/^(Found|No outline)|: /.test(document.querySelector('#found').textContent)")
+    page.click("#mode-looks")
+    page.wait_for_selector("#learn-here:not([disabled])")
+    page.click("#stop-button")
+    page.wait_for_selector("#learn-here[disabled]")
+    page.click("#stop-reset:not([hidden])")
+    page.wait_for_selector("#learn-here:not([disabled])")
 
 
 def test_a_round_is_added_shown_in_the_calendar_and_removed(page: Any, cell: Cell) -> None:

@@ -27,7 +27,7 @@ from service.console.history_page import fits
 from service.console.mirror import Mirror
 from service.console.mission_words import did, step_list
 from service.console.missions_page import plan_table
-from service.console.object_facts import history_html
+from service.console.object_facts import alarm_line, certified, history_html
 from service.console.own_page import is_own
 from service.console.panel_drawing import overlay_svg, panel_svg
 from service.console.range_points import points_of
@@ -71,7 +71,7 @@ def test_every_text_is_used_and_every_text_that_is_used_exists() -> None:
             ):
                 assert node.args[0].value in ENGLISH, f"{file.name} says {node.args[0].value!r}"
     groups = "editor.kind editor.on_failure editor.is editor.move editor.number compare.against"
-    groups += " nav mode state verb column stop step did plan.station alarm limits alarms.do alarms.ask alarms.confirm"
+    groups += " nav mode state verb column stop step did plan.station alarm limits alarms.do alarms.ask alarms.confirm object.ask"
     built = tuple(
         f"{group}." for group in f"{groups} history.span history.outcome role weekday run".split()
     )  # keys that are put together
@@ -92,6 +92,31 @@ def test_values_are_in_the_terms_of_their_object(panel: Panel) -> None:
     refused = reading("pressure", value=None, quality="invalid", cause="glare")
     assert shown(pressure, refused) == "not readable", "no value of a refused reading may be seen"
     assert shown(pressure, None) == "not read yet"
+
+
+def test_a_reading_tells_whether_it_is_sure_and_how_often_such_readings_are_wrong() -> None:
+    told = {"at_most": 0.0099, "assurance": 0.95, "cases": 299, "wrong": 0, "source": "simulation", "none": None}
+    sure = reading("pressure", sure=True, certificate=told)
+    assert certified(sure).startswith(
+        "Sure. Of sure readings of this kind here at most 0.99 % are wrong (95 % assurance; 299"
+    )
+    bare = reading("pressure", sure=True, certificate={"none": "no gauge was judged"})
+    assert certified(bare) == "Sure, without a certificate: no gauge was judged."
+    assert certified(reading("pressure", sure=False, doubt="it is weak", certificate=None)) == "Not sure: it is weak."
+
+
+@pytest.mark.parametrize(
+    ("given", "look", "told"),
+    [
+        ({"state": "unacknowledged", "is_active": True}, "bad", "Alarm: too high. close it"),
+        ({"state": "returned-unacknowledged"}, "warn", "Over, but not acknowledged: too high"),
+        ({"state": "out-of-service", "is_active": True}, "quiet", "Alarm out of service: too high"),
+        ({"state": "shelved"}, "quiet", "Alarm shelved: the condition holds no more"),
+    ],
+)
+def test_an_alarm_calls_only_while_it_is_in_service(given: dict[str, Any], look: str, told: str) -> None:
+    alarm = {"is_active": False, "says": "too high", "what_to_do": "close it", "shelved_until_s": None, **given}
+    assert alarm_line(alarm) == (look, told)
 
 
 def test_a_target_in_degrees_reaches_the_api_in_radians_and_within_its_limits(panel: Panel) -> None:

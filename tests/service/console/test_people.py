@@ -110,8 +110,8 @@ def test_the_mirror_of_a_person_who_has_left_is_ended(monkeypatch: pytest.Monkey
     ("role", "deeds"),
     [
         (Role.OBSERVER, []),
-        (Role.OPERATOR, ["acknowledge", "shelve"]),
-        (Role.MAINTAINER, ["acknowledge", "shelve", "out-of-service"]),
+        (Role.OPERATOR, ["acknowledge", "comment", "shelve"]),
+        (Role.MAINTAINER, ["acknowledge", "comment", "shelve", "out-of-service"]),
     ],
 )
 def test_a_page_offers_only_what_the_role_may_do(role: Role, deeds: list[str]) -> None:
@@ -123,4 +123,6 @@ def test_a_page_offers_only_what_the_role_may_do(role: Role, deeds: list[str]) -
     }  # fmt: skip
     mirror._said = {"alarms": {"alarms": [alarm]}}
     told = alarm_table(mirror)
-    assert [deed for deed in ("acknowledge", "shelve", "out-of-service") if f'data-deed="{deed} ' in told] == deeds
+    assert [
+        deed for deed in ("acknowledge", "comment", "shelve", "out-of-service") if f'data-deed="{deed} ' in told
+    ] == deeds

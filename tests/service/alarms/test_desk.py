@@ -139,6 +139,7 @@ def test_a_reading_becomes_stale_and_only_a_valid_one_ends_that(tmp_path: Path) 
         rig.desk.tick()
         assert rig.desk.get("pressure.stale").is_active
         rig.reads(value)
+        rig.desk.tick()
         assert rig.desk.get("pressure.stale").is_active is wanted
     rig.desk = rig.started(valid_at_s={"pressure": rig.now_s - 200.0})
     rig.desk.tick()

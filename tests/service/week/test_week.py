@@ -1,4 +1,4 @@
-"""A simulated day of rounds, run as the week is, and the parts of which it is made."""
+"""A simulated day of rounds, run as the week is but without pictures, and the parts of which it is made."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from service.missions.files import checked_file
 from service.serve import Options, Panelwright
 from service.week.checks import Left, checks_of, left_by
 from service.week.files import LIMITS, keep_shown, write_plant
-from service.week.run import DAY_S, live_week, serve_week, times_of
+from service.week.run import DAY_S, live_week, times_of
 from service.week.story import Story
+from tests.service.week.plain_looks import operations
 
 BENCH = Path(__file__).parents[3] / "cells/bench.toml"
 NOW_S = 1_790_000_000.0
@@ -37,7 +38,10 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Day]:
     runs = tmp_path_factory.mktemp("week")
     cell = write_plant(BENCH, runs / "plant", seed=11)
     since_s, _, _ = times_of(1.0, NOW_S)
-    panelwright, calendar = serve_week(cell, runs, since_s, inline=True, port=0)
+    calendar = Calendar(since_s)
+    with by_calendar(calendar):
+        options = Options(port=0, runs_dir=runs, inline=True)
+        panelwright = Panelwright(load_cell(cell), options, operations=operations())
     try:
         panelwright.start()
         week = live_week(panelwright, calendar, days=1.0, now_s=NOW_S)

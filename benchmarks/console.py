@@ -26,7 +26,19 @@ from benchmarks.console_served import FINAL, Served, new_page, served, until
 from tests.service.browser import CHROMIUM, FLAGS
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("/", "/missions", "/rounds", "/alarms", "/review", "/history", "/devices", "/setup", "/cell")
+PAGES = (
+    "/",
+    "/missions",
+    "/rounds",
+    "/alarms",
+    "/review",
+    "/history",
+    "/devices",
+    "/setup",
+    "/cell",
+    "/mission-editor",
+    "/teach",
+)
 SIZES, SCHEMES = ((1440, 900), (390, 844)), ("light", "dark")
 BROWSERS = 10
 LONGEST_S = 5.0

@@ -98,6 +98,16 @@ def _pointed(page: Page, service: Served) -> None:
     page.click('button:text-is("Show the scanner\'s points")')
 
 
+def _uploaded(page: Page, _service: Served) -> None:
+    page.set_input_files("#file", ROOT / "docs/images/teach-mushroom.png")
+    until(page, "document.querySelector('#picture').naturalWidth > 0")
+    size = page.locator("#picture").bounding_box()
+    assert size is not None
+    scale = size["width"] / page.evaluate("document.querySelector('#picture').naturalWidth")
+    page.click("#picture", position={"x": 522 * scale, "y": 334 * scale})
+    until(page, "/^(Found|No outline)|: /.test(document.querySelector('#found').textContent)")
+
+
 PICTURES: dict[str, tuple[str, Callable[[Page, Served], None]]] = {
     "panel": ("/", _drawn),
     "object": ("/", _opened),
@@ -108,6 +118,7 @@ PICTURES: dict[str, tuple[str, Callable[[Page, Served], None]]] = {
     "history": ("/history?object=pressure", _several),
     "devices": ("/devices", _nothing),
     "setup": ("/setup", _nothing),
+    "teach": ("/teach", _uploaded),
     "cell": ("/cell", _pointed),
     "mission-editor": ("/mission-editor?mission=demo", _checked),
 }

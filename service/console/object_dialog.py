@@ -13,6 +13,7 @@ from service.access.keys import Role
 from service.client import FINAL
 from service.console.limits_form import LimitsForm
 from service.console.mirror import Mirror
+from service.console.mission_words import did
 from service.console.object_facts import facts_html, history_html
 from service.console.page_frame import attempt, button
 from service.console.service_form import ServiceForm
@@ -182,7 +183,7 @@ class ObjectDialog:
         client, label = self._mirror.client, label_of(one)
         task = await attempt(lambda: client.post(path, body))
         while task is not None and task["state"] not in FINAL:
-            step = task["step"] or say("task.queued")
+            step = did(task["step"], "", self._mirror.panel) if task["step"] else say("task.queued")
             self._told.set_content(attribute(say("object.working", label=label, step=step)))
             await asyncio.sleep(POLL_S)
             task = await attempt(partial(client.get, f"/v1/tasks/{task['id']}"))

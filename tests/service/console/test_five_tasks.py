@@ -52,7 +52,7 @@ def test_set_a_control_only_after_a_yes(page: Any, cell: Cell) -> None:
     until(page, f"{DIALOG}.includes('Give a number from 0 to 100')")
     page.fill(".dialog input", "62")
     page.click(".dialog button:text-is('Set to …')")
-    until(page, f"{DIALOG}.includes('works it from 7.0 % to 62 %')")
+    until(page, f"{DIALOG}.includes('moves it from 7.0 % to 62 %')")
     assert cell.asked == [], "nothing moves before the yes"
     page.click("button:text-is('Yes, move')")
     until(page, "document.querySelector('#dialog-value').textContent === '62.0 %'")

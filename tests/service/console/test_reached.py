@@ -14,7 +14,7 @@ import pytest
 from service.access.keys import Role
 from service.exposure import Exposure
 from tests.service.browser import NEEDS_CHROMIUM
-from tests.service.conftest import WriteCell
+from tests.service.conftest import WriteCell, _write
 from tests.service.console import nginx
 from tests.service.console.nginx import Nginx
 from tests.service.console.served import Cell, until
@@ -25,17 +25,17 @@ pytestmark = NEEDS_CHROMIUM
 KEYS = {"bob": Role.OBSERVER, "carol": Role.OPERATOR}
 
 
-@pytest.fixture
-def proxied(write_cell: WriteCell, tmp_path: Path) -> Iterator[tuple[Cell, str]]:
+@pytest.fixture(scope="module")
+def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cell, str]]:
     """Yield a cell behind a proxy that ends TLS, and the address of its console there.
 
     The proxy is nginx with the example of the documentation, and a small one of the tests where nginx is not installed.
     """
-    proxy = (Nginx if nginx.PROGRAM.exists() else TlsProxy)(*certificate(tmp_path))
-    runs = tmp_path / "runs"
-    exposure = Exposure(names=(f"localhost:{proxy.port}",), behind_proxy=True, unix_socket=tmp_path / "socket")
-    cell = Cell(write_cell, runs, keys=KEYS, exposure=exposure)
-    proxy.start(service=tmp_path / "socket", console_port=cell.console.port)
+    folder = tmp_path_factory.mktemp("proxied")
+    proxy = (Nginx if nginx.PROGRAM.exists() else TlsProxy)(*certificate(folder))
+    exposure = Exposure(names=(f"localhost:{proxy.port}",), behind_proxy=True, unix_socket=folder / "socket")
+    cell = Cell(lambda **given: _write(folder, **given), folder / "runs", keys=KEYS, exposure=exposure)
+    proxy.start(service=folder / "socket", console_port=cell.console.port)
     yield cell, f"https://localhost:{proxy.port}"
     proxy.close()
     cell.service.close()

@@ -80,6 +80,16 @@ def test_two_rounds_run_one_after_the_other(tmp_path: Path) -> None:
     assert (one.states("a"), one.states("b")) == (["succeeded"], ["running"])
 
 
+def test_a_round_waits_for_another_that_only_waits_for_its_turn(tmp_path: Path) -> None:
+    one = Rig(folder=tmp_path, sections=[section("a"), section("b")], now_s=START_S)
+    one.queues = True  # nothing moves yet, so only the keeper knows that a round has begun
+    one.why_not = lambda _section: None  # type: ignore[method-assign]
+    one.tick(TO_DUE_S)
+    one.tick(1.0)
+    assert (one.states("a"), one.states("b")) == (["running"], [])
+    assert {one.section.name: one.waits_for for one in one.keeper.prospects()}["b"] == "another round runs"
+
+
 def test_a_lease_taken_at_the_last_moment_lets_the_run_wait(tmp_path: Path) -> None:
     one = rig(tmp_path)
     one.error = LeaseError("alice holds the cell", hint="wait")
@@ -125,6 +135,20 @@ def test_a_clock_that_is_set_back_repeats_no_run(tmp_path: Path) -> None:
         one.tick(300.0)
     dues_s = [run.due_s for run in one.keeper.runs()]
     assert sorted(set(dues_s)) == sorted(dues_s) == [START_S + TO_DUE_S]
+
+
+def test_a_clock_that_is_set_back_while_the_plan_changes_repeats_no_run(tmp_path: Path) -> None:
+    one = rig(tmp_path)
+    one.tick(TO_DUE_S)
+    one.tick(DURATION_S)
+    one.now_s -= 2 * HOUR_S
+    one.sections = [section(cron="*/30 * * * *")]
+    one.restart()
+    for _ in range(26):
+        one.tick(300.0)
+    dues_s = [run.due_s for run in one.keeper.runs()]
+    assert len(set(dues_s)) == len(dues_s)
+    assert min(dues_s) == START_S + TO_DUE_S, "nothing before it is made up for"
 
 
 def test_rounds_over_the_api_are_kept_and_those_of_the_cell_file_are_not_changed(tmp_path: Path) -> None:

@@ -72,8 +72,9 @@ def _row(alarm: dict[str, Any], mirror: Mirror) -> str:
         f'<tr><td><span class="chip {LOOKS[alarm["priority"]]}">{attribute(alarm["priority"])}</span></td>'
         f"<td><b>{attribute(label)}</b></td><td>{attribute(alarm['says'])}<br>"
         f'<span class="quiet">{attribute(alarm["what_to_do"])}</span></td>'
-        f'<td>{attribute(state)}<br><span class="quiet">{holds}</span></td><td>{clock(alarm["raised_s"])}</td>'
-        f'<td>{attribute(last)}</td><td class="deeds">{buttons}</td></tr>'
+        f'<td>{attribute(state)}<br><span class="quiet">{holds}</span></td>'
+        f'<td data-head="{attribute(say("column.since"))}">{clock(alarm["raised_s"])}</td>'
+        f'<td data-head="{attribute(say("column.last"))}">{attribute(last)}</td><td class="deeds">{buttons}</td></tr>'
     )
 
 

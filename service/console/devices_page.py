@@ -97,10 +97,11 @@ class _Values:
         aged = "–" if reading is None or reading["age_s"] is None else f"{reading['age_s']:.2f} s"
         return (
             f"<tr><td><b>{attribute(name)}</b></td><td>{attribute(device['kind'].replace('_', ' '))}</td>"
-            f'<td class="quiet">{attribute(device["driver"])}</td>'
+            f'<td class="quiet" data-head="{say("column.driver")}">{attribute(device["driver"])}</td>'
             f'<td class="{"good" if is_good else "bad"}">{attribute(quality)}</td><td>{attribute(value)}</td>'
-            f"<td>{attribute(self._rate(device, rate_hz))}</td>"
-            f'<td>{aged}</td><td>{attribute(fault)} <span class="quiet">{counts}</span> {again}</td></tr>'
+            f'<td data-head="{say("column.rate")}">{attribute(self._rate(device, rate_hz))}</td>'
+            f'<td data-head="{say("column.age")}" style="white-space:nowrap">{aged}</td>'
+            f'<td>{attribute(fault)} <span class="quiet">{counts}</span> {again}</td></tr>'
         )
 
     def _rate(self, device: dict[str, Any], rate_hz: float | None) -> str:
@@ -122,10 +123,12 @@ def is_sim(mirror: Mirror) -> bool:
 
 def shown_value(kind: str, value: Any) -> str:
     """Return a device's value with its units and the names of its parts, which a bare number or list does not carry."""
+    if kind == "proximity" and value is None:
+        return say("device.nothing_near")
     if kind == "proximity" and isinstance(value, int | float):
         return say("device.distance", distance=f"{value:.3f}")
     if kind == "touch" and isinstance(value, list) and len(value) == 2:
-        left, right = (in_words(one) for one in value)
+        left, right = (say("device.touched" if one else "device.free") for one in value)
         return say("device.touch", left=left, right=right)
     if kind == "lights" and isinstance(value, list):
         return say("device.lights", states=" ".join(say("device.on" if one else "device.off") for one in value))

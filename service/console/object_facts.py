@@ -28,9 +28,9 @@ def facts_html(one: PanelObject, reading: Reading | None, alarm: dict[str, Any] 
             parts.append(f'<p class="warn">{attribute(say("object.refused", cause=reading["cause"]))}</p>')
         elif told := certified(reading):
             parts.append(f'<p class="quiet">{attribute(told)}</p>')
-        where = say(
-            "object.from", verb=word("verb", reading["verb"]), phase=reading["phase"] or clock(reading["utc_s"])
-        )
+        taken = {"verb": word("verb", reading["verb"]), "when": clock(reading["utc_s"])}
+        phase = reading["phase"]
+        where = say("object.from.phase", **taken, phase=phase) if phase else say("object.from", **taken)
         parts.append(f'<p class="quiet">{attribute(where)}</p>')
     if alarm is not None:
         look, told = alarm_line(alarm)
@@ -57,7 +57,8 @@ def alarm_line(alarm: dict[str, Any]) -> tuple[str, str]:
         holds = alarm["says"] if alarm["is_active"] else say("alarms.gone")
         return "quiet", say("object.alarm_off", state=f"{word('alarm', alarm['state'])}{until}", says=holds)
     if alarm["is_active"]:
-        return "bad", say("object.alarm", says=alarm["says"], what_to_do=alarm["what_to_do"]).rstrip()
+        advice = alarm["what_to_do"]
+        return "bad", say("object.alarm", says=alarm["says"], what_to_do=advice[:1].upper() + advice[1:]).rstrip()
     return "warn", say("object.alarm_over", says=alarm["says"])
 
 

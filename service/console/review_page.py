@@ -60,7 +60,7 @@ class _Desk:
             self._other = ui.input(label=say("review.other")).props("outlined dense maxlength=100")
             self._other.on("keydown.enter", self._send_other)
             button(say("review.send"), self._send_other, look="plain")
-            self._you = you_field(mirror)
+            self._you = you_field(mirror).style("min-width:16rem")
         ui.html(say("review.says"), sanitize=False, tag="p").classes("quiet")
         ui.keyboard(self._key, repeating=False, ignore=["input", "select", "textarea"])
 

@@ -23,7 +23,7 @@ class ServiceForm:
 
     def __init__(self, mirror: Mirror) -> None:
         self._mirror = mirror
-        self._holder = ui.element("div")
+        self._holder = ui.element("div").style("margin:.6rem 0")
         self._name = ""
 
     async def show(self, one: PanelObject) -> None:
@@ -43,10 +43,10 @@ class ServiceForm:
                 ui.html(attribute(told), sanitize=False, tag="p").classes("warn")
             if may and len(out) < len(alarms):
                 rest = [alarm["id"] for alarm in alarms if alarm["state"] != OUT]
-                button(say("alarms.do.out-of-service"), lambda: self._ask(one, OUT, rest), look="plain")
+                button(say("object.do.out-of-service"), lambda: self._ask(one, OUT, rest), look="plain")
             if may and out:
                 back = [alarm["id"] for alarm in out]
-                button(say("alarms.do.in-service"), lambda: self._ask(one, "in-service", back), look="plain")
+                button(say("object.do.in-service"), lambda: self._ask(one, "in-service", back), look="plain")
 
     def _ask(self, one: PanelObject, deed: str, alarms: list[str]) -> None:
         """Ask who does it and why."""

@@ -41,6 +41,10 @@ class Observer(Protocol):
         """The key, else the holder of the lease, that asked for the task; empty without both."""
         ...
 
+    def now_s(self) -> float:
+        """Return the time by which readings are stamped, seconds since 1970."""
+        ...
+
     def newest(self) -> Mapping[str, Mapping[str, Any]]:
         """Return the fields of the newest reading of each object, by its name."""
         ...
@@ -65,6 +69,10 @@ class NoObserver:
     def asked_by(self) -> str:
         """Nobody is known."""
         return ""
+
+    def now_s(self) -> float:
+        """The time of the machine."""
+        return time.time()
 
     def newest(self) -> Mapping[str, Mapping[str, Any]]:
         """Nothing is known."""
@@ -146,6 +154,10 @@ class TaskObserver:
     def asked_by(self) -> str:
         """The key, else the holder of the lease, that asked for the task; see `Observer.asked_by`."""
         return str(self._by["asked_by"])
+
+    def now_s(self) -> float:
+        """Return the time by which readings are stamped; see `Observer.now_s`."""
+        return self._kept.now_s()
 
     def newest(self) -> Mapping[str, Mapping[str, Any]]:
         """Return the fields of the newest reading of each object, by its name; see `Observer.newest`."""

@@ -63,7 +63,7 @@ class DoubtView(BaseModel):
 
 
 class AlarmList(BaseModel):
-    """Alarms that are not normal, those that need a person first; and limits that a value straddles without an alarm."""
+    """Alarms that are not normal, those that need a person first, then by priority; and limits that a value straddles."""
 
     alarms: list[AlarmView]
     straddled: list[DoubtView]
@@ -179,10 +179,10 @@ async def _done(state: AppState, deed: Callable[[], Alarm]) -> AlarmView:
     return _view(state, await state.act(deed))
 
 
-def _rank(state: AppState, alarm: Alarm) -> tuple[bool, bool, int, float]:
+def _rank(state: AppState, alarm: Alarm) -> tuple[bool, int, bool, float]:
     needs_nobody = alarm.state in (State.NORMAL, State.ACKNOWLEDGED, *SUPPRESSED)
     priority = state.service.cell.panel.object(alarm.object).priority
-    return needs_nobody, not alarm.is_active, PRIORITIES.index(priority), -alarm.changed_s
+    return needs_nobody, PRIORITIES.index(priority), not alarm.is_active, -alarm.changed_s
 
 
 def _view(state: AppState, alarm: Alarm) -> AlarmView:

@@ -71,7 +71,8 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
     progress = _progress_of(context, request)
     if request.dry_run:
         return plan_mission(Session(context=context), progress)
-    name = time.strftime("%Y%m%dT%H%M%S", time.gmtime()) + f"-{context.task.id}"
+    begun_s = context.observer.now_s()
+    name = time.strftime("%Y%m%dT%H%M%S", time.gmtime(begun_s)) + f"-{context.task.id}"
     record = MissionRecord(
         mission=name,
         cell=cell.name,
@@ -81,6 +82,7 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         title=progress.mission.title,
         origin=origin_of(cell, asked_by=context.observer.asked_by, newest=context.observer.newest()),
         now_s=context.connection.clock.now_s,
+        started_wall=begun_s,
     )
     progress.path = context.runs_dir / name / FILE
     progress.save()

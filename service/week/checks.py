@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from calendar import timegm
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,6 +21,7 @@ from service.week.story import DARK_AT
 
 NEAR_BAR = 0.3  # around a limit, within which a reading may fall on either side
 SPANS = 100
+LATEST_S = 600.0  # from the time of a round to that of its report, on a busy machine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,6 +226,12 @@ def _files(left: Left) -> Iterator[Check]:
     yield Check(
         says="every round has left a report", holds=not lacking, saw=", ".join(lacking) or f"{len(left.week.rounds)}"
     )
+    others = [one.mission for one in left.week.rounds if not 0.0 <= _begun_s(one.mission) - one.due_s <= LATEST_S]
+    yield Check(
+        says="every report has the time of its round",
+        holds=not others,
+        saw=", ".join(others[:3]) or f"{len(left.week.rounds)}",
+    )
     panel = load_cell(left.cell).panel
     same = [
         name
@@ -232,6 +241,14 @@ def _files(left: Left) -> Iterator[Check]:
     yield Check(
         says="the limits stand in the week's own panel file", holds=len(same) == len(LIMITS), saw=", ".join(same)
     )
+
+
+def _begun_s(mission: str) -> float:
+    """Return when a mission began by its name, seconds since 1970; 0 for a name that is none."""
+    try:
+        return float(timegm(time.strptime(mission.partition("-")[0], "%Y%m%dT%H%M%S")))
+    except ValueError:
+        return 0.0
 
 
 def _is_watched(panel: Panel, name: str) -> bool:

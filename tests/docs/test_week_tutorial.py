@@ -74,7 +74,7 @@ def test_the_tutorial_leads_to_an_alarm_a_review_and_a_trend(tmp_path: Path) -> 
     told = "\n".join(printed)
     for words in (
         "morning fits panel bench",
-        "20 of 20 checks hold",
+        "21 of 21 checks hold",
         "pump_on",
         "clean the filter",
         "is answered: unreadable",

@@ -47,7 +47,7 @@ def test_the_alarms_of_an_object_are_taken_out_of_service_and_put_back(page: Any
     cell.record(95.0)
     page.goto(cell.url)
     page.click("g[data-object=setpoint]")
-    page.click(".dialog button:text-is('Out of service …')")
+    page.click(".dialog button:text-is('Alarms out of service …')")
     page.click(".dialog button:text-is('Take out of service')")
     until(page, f"{DIALOG}.includes('Give your name first')")
     assert desk.get("setpoint.high").state == "unacknowledged"
@@ -58,7 +58,7 @@ def test_the_alarms_of_an_object_are_taken_out_of_service_and_put_back(page: Any
     assert {one.state for one in desk.all() if one.object == "setpoint"} == {"out-of-service"}
     until(page, f"{DIALOG}.includes('Alarm out of service: setpoint shows 95 %, above high 90')")
     until(page, "document.querySelector('nav .count') === null")
-    page.click(".dialog button:text-is('Put back in service')")
+    page.click(".dialog button:text-is('Put alarms back in service')")
     page.fill(".dialog input[aria-label='Your name, for the record']", "alice")
     page.fill(".dialog input[aria-label=Reason]", "it is new")
     page.click(".dialog button:text-is('Put back in service')")
@@ -101,7 +101,7 @@ def test_the_console_teaches_by_clicks(page: Any, cell: Cell, tmp_path: Path) ->
     cv2.circle(picture, (320, 240), 60, (20, 20, 220), -1)
     cv2.imwrite(str(tmp_path / "panel.png"), picture)
     page.goto(f"{cell.url}/setup")
-    page.click("button:text-is('Teach more')")
+    page.click("button:text-is('Teach by clicks')")
     page.wait_for_url("**/teach")
     until(page, "document.querySelector('#known-line').textContent.includes('kinds')")
     page.set_input_files("#file", str(tmp_path / "panel.png"))

@@ -108,7 +108,7 @@ def test_a_reading_tells_whether_it_is_sure_and_how_often_such_readings_are_wron
 @pytest.mark.parametrize(
     ("given", "look", "told"),
     [
-        ({"state": "unacknowledged", "is_active": True}, "bad", "Alarm: too high. close it"),
+        ({"state": "unacknowledged", "is_active": True}, "bad", "Alarm: too high. Close it"),
         ({"state": "returned-unacknowledged"}, "warn", "Over, but not acknowledged: too high"),
         ({"state": "out-of-service", "is_active": True}, "quiet", "Alarm out of service: too high"),
         ({"state": "shelved"}, "quiet", "Alarm shelved: the condition holds no more"),
@@ -264,7 +264,8 @@ def test_an_unreachable_station_is_told_in_the_plan(panel: Panel) -> None:
 
 def test_values_of_devices_have_units_and_names() -> None:
     assert shown_value("proximity", 0.47931) == "0.479 m"
-    assert shown_value("touch", [False, True]) == "left no, right yes"
+    assert shown_value("touch", [False, True]) == "left free, right touched"
+    assert shown_value("proximity", None) == "nothing in its range"
     assert shown_value("lights", [True, False]) == "lights on off"
     assert shown_value("gripper", {"width_m": 0.04, "is_moving": False}) == "width 0.04 m, moving no"
     assert shown_value("force_torque", {"force_n": [1.0, 2.5, 0.0]}) == "force 1 2.5 0 N"

@@ -69,7 +69,7 @@ def test_rounds_are_added_listed_and_removed(http: httpx2.Client, rounds: Panelw
 @pytest.mark.parametrize(
     ("path", "change", "told"),
     [
-        ("evening", {"cron": "0 25 * * *"}, "Bad hour"),
+        ("evening", {"cron": "0 25 * * *"}, "its hour cannot be meant"),
         ("evening", {"zone": "Mars/Olympus"}, "no IANA time zone"),
         ("evening", {"mission": "inspekt"}, "did you mean 'inspect'"),
         ("evening", {"forbidden_by": ["pump_lamp.stat"]}, "pump_lamp.state"),

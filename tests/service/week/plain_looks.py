@@ -96,7 +96,7 @@ def operations() -> dict[str, Operation]:
 
     def run_mission(context: OperationContext, request: MissionRequest) -> MissionTold:
         checked = mission_of(request, context.connection.cell)
-        name = time.strftime("%Y%m%dT%H%M%S", time.gmtime()) + f"-{context.task.id}"
+        name = time.strftime("%Y%m%dT%H%M%S", time.gmtime(context.observer.now_s())) + f"-{context.task.id}"
         hands = PlainHands(context, name, worked)
         interpreter = Interpreter(
             hands=hands, progress=Progress(mission=checked.mission, library=checked.library, path=None)

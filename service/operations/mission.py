@@ -141,10 +141,8 @@ def _report(record: MissionRecord, folder: Path) -> bool:
 
 def _run(worker: _Worker, interpreter: Interpreter) -> None:
     session, record = worker.session, worker.record
-    tolerance = next(
-        (step.wanted for step in interpreter.progress.all_steps() if isinstance(step, FeelStep)), WantedPose()
-    )
-    worker.found = _find(session, record, tolerance.tolerance())
+    wanted = [step.wanted for step in interpreter.progress.all_steps() if isinstance(step, FeelStep)] or [WantedPose()]
+    worker.found = _find(session, record, wanted[0].tolerance())
     with _step(session, "recognise", 0.19, FOUND) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # until the border lights are out

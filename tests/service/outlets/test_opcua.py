@@ -22,9 +22,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import NameOID
 
-from hal.errors import ConfigError
-from hal.outlets import OpcuaSection, OutletsSection
-from hal.strict import validate
+from hal.outlets import OpcuaSection
 from service.outlets.opcua import NAMESPACE, OpcuaOutlet
 from service.outlets.opcua_nodes import CODES, UNECE, unit_of
 from tests.service.outlets.fakes import FakeSource, no_pause
@@ -345,20 +343,6 @@ def test_units_have_the_numbers_that_unece_gives_them() -> None:
     assert unit_of("°C").UnitId == 4408652, "the example of OPC 10000-8"
     assert unit_of("furlong").UnitId == -1
     assert all(2 <= len(code) <= 3 for code in CODES.values())
-
-
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        ({"username": "scada"}, "go together"),
-        ({"certificate_file": "a.pem"}, "go together"),
-        ({"acknowledge": True}, "anybody could acknowledge"),
-        ({"key_file": "key"}, "of use only with"),
-    ],
-)
-def test_a_section_that_cannot_be_meant_is_refused(given: dict[str, Any], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
-        validate({"opcua": given}, OutletsSection, source="cell.toml")
 
 
 def test_without_the_section_the_library_is_not_imported() -> None:

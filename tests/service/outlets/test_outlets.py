@@ -24,6 +24,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from hal.config import load_cell
 from hal.errors import ConfigError
 from hal.outlets import MqttSection, OutletsSection, PrometheusSection, WebhookSection
+from hal.strict import validate
 from service.access.keys import Role
 from service.client import ApiError
 from service.commissioning.outlets import checked_outlets
@@ -226,6 +227,21 @@ def test_all_faults_of_the_outlets_are_named_at_once(tmp_path: Path) -> None:
         "outlets.mqtt.password_file",
         "outlets.webhook.secret_file",
     ]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"opcua": {"username": "scada"}}, "go together"),
+        ({"opcua": {"certificate_file": "a.pem"}}, "go together"),
+        ({"opcua": {"acknowledge": True}}, "anybody could acknowledge"),
+        ({"opcua": {"key_file": "key"}}, "of use only with"),
+        ({"opcua": {"port": 9464}, "prometheus": {}}, "both listen at port 9464"),
+    ],
+)
+def test_a_section_that_cannot_be_meant_is_refused(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        validate(given, OutletsSection, source="cell.toml")
 
 
 def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,6 +146,13 @@ class SafetySection(Strict):
     wrench_lost: Annotated[
         LossAction, Field(description="the same for a force/torque sensor that is silent or impossible in a motion")
     ] = "hold"
+    service_lost: Annotated[
+        LossAction,
+        Field(
+            description="what happens when the service process ends, is suspended or hangs: the stop is latched at once, `stop` "
+            "switches the drives off, `hold` leaves them on, `retreat` lets an arm that moved go back first"
+        ),
+    ] = "stop"
     max_reading_age_s: Positive = 0.1
     joint_limits_rad: Annotated[
         tuple[tuple[float, float], ...],

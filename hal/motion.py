@@ -97,10 +97,12 @@ class CellSignals:
     Attributes:
         is_reduced: whether people are near, so that the reduced speed holds.
         keeps_power: whether a latched stop leaves the drives on, so that they hold the arm.
+        goes_back: whether a motion that a latched stop ends is followed by the way back, because the service is lost.
     """
 
     is_reduced: Callable[[], bool] = lambda: False
     keeps_power: Callable[[], bool] = lambda: False
+    goes_back: Callable[[], bool] = lambda: False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

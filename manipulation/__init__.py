@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from manipulation.arm.kinematics import Kinematics
     from manipulation.control.controller import Controller
     from manipulation.control.sensing import MotionDevices
+    from manipulation.control.way_back import Trail
     from manipulation.planning.hand import Hand
     from manipulation.planning.shapes import CollisionBox
     from manipulation.planning.time_parameterization import SpeedLimits
@@ -38,6 +39,7 @@ __all__ = [
     "SkillFailure",
     "SkillReport",
     "SpeedLimits",
+    "Trail",
     "Verify",
     "back_out_of",
     "free_hand",

@@ -50,13 +50,13 @@ class ControlThread:
             self._thread = threading.Thread(target=self._loop, name="control", daemon=True)
             self._thread.start()
 
-    def close(self) -> None:
+    def close(self, *, within_s: float = JOIN_S) -> None:
         """Refuse new jobs, finish the running one and end the thread; a second call does nothing."""
         with self._gate:
             self._is_closing = True
         self._jobs.put(None)
         if self._thread is not None:
-            self._thread.join(timeout=JOIN_S)
+            self._thread.join(timeout=within_s)
 
     @property
     def ticking(self) -> int | None:

@@ -18,7 +18,7 @@ from hal.arrays import Array
 from hal.calibration import ToolLoad
 from hal.clock import Clock, SimClock
 from hal.config import SafetySection
-from hal.errors import CellError, DeviceFault, MotionRefused, Stopped
+from hal.errors import DeviceFault, MotionRefused, Stopped
 from hal.geometry import identity
 from hal.motion import (
     CartesianPath,
@@ -31,7 +31,7 @@ from hal.motion import (
 from manipulation.arm import kernels as arm_kernels
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control import braking, kernels
-from manipulation.control.control_thread import ControlThread
+from manipulation.control.control_thread import JOIN_S, ControlThread
 from manipulation.control.drives import Drives
 from manipulation.control.executors import Executor, Tick, begin
 from manipulation.control.following_error import FollowingErrorMonitor
@@ -41,10 +41,10 @@ from manipulation.control.sensing import (
     DeviceFailure,
     Devices,
     MotionDevices,
-    RangeReader,
     Sample,
     ToolReading,
     ToolView,
+    range_readers,
     refuse,
     state_of,
 )
@@ -57,6 +57,7 @@ from manipulation.control.termination import (
     has_settled,
     speed_limit_m_per_s,
 )
+from manipulation.control.way_back import LONGEST_S, WayBack
 from manipulation.plausibility.hand import TouchMonitor
 from manipulation.plausibility.repetition import RepeatedWrench
 
@@ -90,17 +91,12 @@ class Controller:
         flange_from_grip: RigidTransform | None = None,
         rate_hz: float | None = None,
     ) -> None:
-        # In lockstep a late reading is never an accident of timing.
-        patience_s = (1.0 if isinstance(clock, SimClock) else 3.0) * safety.max_reading_age_s
         self._devices = Devices(
             arm=devices.arm,
             gripper=devices.gripper,
             force_torque=devices.force_torque,
             touch=devices.touch,
-            proximities=tuple(
-                RangeReader(sensor, clock, max_age_s=safety.max_reading_age_s, patience_s=patience_s)
-                for sensor in devices.proximities
-            ),
+            proximities=range_readers(devices.proximities, clock, max_age_s=safety.max_reading_age_s),
             clock=clock,
             max_age_s=safety.max_reading_age_s,
             repeated_wrench=RepeatedWrench(devices.force_torque),
@@ -114,6 +110,7 @@ class Controller:
         self._contact = ContactWrench(load, flange_from_sensor)
         self._is_latched = is_latched
         self._signals = signals or CellSignals()
+        self._way_back = WayBack(self._signals, clock, self._perform)
         self._grip = flange_matrix(identity() if flange_from_grip is None else flange_from_grip)
         self._dt_s = 1.0 / (rate_hz or capabilities.command_rate_hz)
         self._filter = SetPointLimiter(self.kinematics, self._grip, safety.speed_limit_m_per_s, self._dt_s)
@@ -138,10 +135,10 @@ class Controller:
         self._thread.start()
 
     def close(self) -> None:
-        """Cancel the running motion, stop the arm and end the thread; a second call does nothing."""
+        """Cancel the running motion (not a way back), stop the arm and end the thread; a second call does nothing."""
         self._is_closing = True  # a motion that begins at this moment clears `_cancel`
         self._cancel.set()
-        self._thread.close()
+        self._thread.close(within_s=JOIN_S + (LONGEST_S if self._signals.goes_back() else 0.0))
 
     def ticking(self) -> int | None:
         """Return the id of the control thread while it must have a turn in each tick; see `ControlThread.ticking`."""
@@ -225,6 +222,16 @@ class Controller:
     def _execute(self, motion: DeclaredMotion) -> MotionReport:
         if self._is_latched():
             raise Stopped("the stop latch is set", hint="reset the stop, then command again")
+        report = self._perform(motion)
+        self._way_back.note(report)
+        if report.outcome is MotionOutcome.STOPPED and self._drives.are_on:
+            try:
+                self._way_back.go(motion.limits)
+            finally:
+                self._stop_drives()
+        return report
+
+    def _perform(self, motion: DeclaredMotion) -> MotionReport:
         check_is_felt(motion, has_force_torque=self._devices.force_torque is not None)
         tool = flange_matrix(motion.flange_from_tool) if isinstance(motion, CartesianPath) else self._grip
         started_s = self._clock.now_s()
@@ -238,7 +245,7 @@ class Controller:
                 self.kinematics, tool, self._safety.speed_limit_m_per_s, self._dt_s, self._safety.workspace
             )
             self._standing.resume(sample.position_rad, self._filter)
-            run = self._begin(motion, sample)
+            run = begin(motion, self.kinematics, self._devices.gripper, sample, self._clock)
         except DeviceFailure as failure:
             self._standing.give_up(failure.device)
             end = Termination(outcome=MotionOutcome.FAULT, cause=f"{failure}; nothing moved", device=failure.device)
@@ -252,13 +259,6 @@ class Controller:
             self._is_moving = self._is_retreat = False
         return self._report(motion, end, started_s, view, recorder)
 
-    def _begin(self, motion: DeclaredMotion, sample: Sample) -> Executor:
-        try:
-            return begin(motion, self.kinematics, self._devices.gripper, sample, self._clock)
-        except CellError as error:
-            device = str(error.details.get("device", self._devices.gripper.name))
-            raise DeviceFailure(device, error.what) from error
-
     def _run(
         self, motion: DeclaredMotion, run: Executor, sample: Sample, view: ToolView, recorder: Recorder
     ) -> Termination:
@@ -269,8 +269,8 @@ class Controller:
             force_limit_n(motion, self._safety.force_limit_n),
             look,
             arm=self._devices.arm.name,
-            is_latched=self._is_latched,
-            is_cancelled=lambda: self._is_closing or self._cancel.is_set(),
+            is_latched=self._way_back.must_end if self._way_back.is_going else self._is_latched,
+            is_cancelled=lambda: not self._way_back.is_going and (self._is_closing or self._cancel.is_set()),
         )
         ticks = 0
         late_s = 0.0
@@ -292,9 +292,8 @@ class Controller:
                                 run.pads.check_end(sample)
                                 self._touch_monitor.pads_moved(run.pads.begun_m, sample.pads)
                             return Termination(outcome=MotionOutcome.COMPLETED, cause=cause_of_end(motion, left_rad))
-                    self._filter.slow_to(
-                        speed_limit_m_per_s(motion, self._safety, is_reduced=self._signals.is_reduced())
-                    )
+                    is_reduced = self._way_back.is_going or self._signals.is_reduced()
+                    self._filter.slow_to(speed_limit_m_per_s(motion, self._safety, is_reduced=is_reduced))
                     out = self._filter.apply(wanted)
                     late_s += self._dt_s * self._filter.waiting_share(wanted, out)
                     self._send(out)
@@ -326,7 +325,7 @@ class Controller:
         except DeviceFailure as failure:
             self._not_stopped = (str(failure),)
             self._drives.switch_off()
-        if end.outcome is MotionOutcome.STOPPED:
+        if end.outcome is MotionOutcome.STOPPED and not self._signals.goes_back():
             self._stop_drives()
         self._standing.give_up(end.device)
         with suppress(DeviceFailure):

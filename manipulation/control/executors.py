@@ -18,7 +18,7 @@ from hal.motion import CartesianPath, Compliance, GripperMotion, Hold, JointTraj
 from manipulation.arm import kernels as arm_kernels
 from manipulation.arm.kinematics import Kinematics
 from manipulation.control import kernels
-from manipulation.control.sensing import Sample, command_wait_s, refuse
+from manipulation.control.sensing import DeviceFailure, Sample, command_wait_s, refuse
 from manipulation.plausibility.hand import wrong_width
 
 BLEND_S = 0.25  # the gap between the declared and the measured start is closed over this time
@@ -286,17 +286,24 @@ def begin(
     sample: Sample,
     clock: Clock,
 ) -> Executor:
-    """Return the executor of a motion that starts at the measured joints of `sample`."""
-    match motion:
-        case JointTrajectory():
-            pads = None if motion.pads is None else GripperExecutor(motion.pads, gripper, sample, clock)
-            return TrajectoryExecutor(motion, sample.position_rad, pads)
-        case CartesianPath():
-            return PathExecutor(motion, kinematics, sample.position_rad)
-        case Hold():
-            return HoldExecutor(motion)
-        case GripperMotion():
-            return GripperExecutor(motion, gripper, sample, clock)
+    """Return the executor of a motion that starts at the measured joints of `sample`.
+
+    Raises:
+        DeviceFailure: the gripper did not accept its command.
+    """
+    try:
+        match motion:
+            case JointTrajectory():
+                pads = None if motion.pads is None else GripperExecutor(motion.pads, gripper, sample, clock)
+                return TrajectoryExecutor(motion, sample.position_rad, pads)
+            case CartesianPath():
+                return PathExecutor(motion, kinematics, sample.position_rad)
+            case Hold():
+                return HoldExecutor(motion)
+            case GripperMotion():
+                return GripperExecutor(motion, gripper, sample, clock)
+    except CellError as error:
+        raise DeviceFailure(str(error.details.get("device", gripper.name)), error.what) from error
 
 
 def _fade(elapsed_s: float) -> float:

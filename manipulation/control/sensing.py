@@ -135,6 +135,12 @@ class RangeReader:
         return reading.usable(now_s=now_s, max_age_s=self._max_age_s, device=self.name)
 
 
+def range_readers(sensors: Sequence[Proximity], clock: Clock, *, max_age_s: float) -> tuple[RangeReader, ...]:
+    """Return a reader of each sensor; in lockstep a late reading is never an accident of timing."""
+    patience_s = (1.0 if isinstance(clock, SimClock) else 3.0) * max_age_s
+    return tuple(RangeReader(sensor, clock, max_age_s=max_age_s, patience_s=patience_s) for sensor in sensors)
+
+
 def read_wait_s(clock: Clock) -> float:
     """Return how long one tick may wait for a device."""
     return PACED_WAIT_S if isinstance(clock, PacedClock) else READ_WAIT_S

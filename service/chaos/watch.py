@@ -10,9 +10,11 @@ from typing import Any
 
 from hal.errors import CellError
 from service.chaos.plant import Plant
+from service.processes.latch import StopLevel
 
 EVERY_S = 0.2
 REST_S = 3.0  # after a stop: a simulated arm of a busy machine needs this long to come to rest
+BACK_S = 8.0  # more, if the stop lets it go back the way it came (`service_lost` of the cell file)
 STILL_RAD = 0.003  # noise and sag
 
 
@@ -23,11 +25,13 @@ class Sight:
     Attributes:
         at_s: monotonic time.
         stop: what stays the same as long as the stop stays latched; None while it is clear.
+        rest_s: the time after which the arm must have come to rest.
     """
 
     at_s: float
     stop: tuple[Any, ...] | None
     position_rad: tuple[float, ...]
+    rest_s: float = REST_S
 
 
 def motions_while_latched(sights: Sequence[Sight]) -> list[str]:
@@ -39,7 +43,7 @@ def motions_while_latched(sights: Sequence[Sight]) -> list[str]:
         if sight.stop is None or first is None or first.stop != sight.stop:
             first, rest = sight if sight.stop is not None else None, None
             continue
-        if sight.at_s - first.at_s < REST_S:
+        if sight.at_s - first.at_s < sight.rest_s:
             continue
         if rest is None:
             rest = sight
@@ -92,15 +96,18 @@ class Watch:
             after = self._stop()
         except (CellError, KeyError, TypeError, ValueError):
             return None
-        return Sight(at_s=time.monotonic(), stop=before, position_rad=position) if before == after else None
+        if before != after:
+            return None
+        rest_s = REST_S + (BACK_S if before is not None and before[-1] == StopLevel.RETREAT else 0.0)
+        return Sight(at_s=time.monotonic(), stop=before, position_rad=position, rest_s=rest_s)
 
     def _stop(self) -> tuple[Any, ...] | None:
-        """Return life, cell process and count of a latched stop: a new simulated world begins elsewhere."""
+        """Return life, cell process, count and level of a latched stop: a new simulated world begins elsewhere."""
         stop = self.plant.stop_client(1.0).get("/v1/stop")
         if not stop["is_latched"]:
             return None
         roles = self.plant.roles()
-        return (self.plant.life, roles.get("cell"), roles.get("world"), stop["count"])
+        return (self.plant.life, roles.get("cell"), roles.get("world"), stop["count"], stop["level"])
 
 
 def _joints(reading: Any) -> Iterable[Any]:

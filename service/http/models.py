@@ -242,7 +242,10 @@ class StopView(BaseModel):
     source: str
     level: Annotated[
         str,
-        Field(description="off: the drives are switched off when the arm is at rest; hold: they stay on and hold it"),
+        Field(
+            description="off: the drives are switched off when the arm is at rest; hold: they stay on and hold it; retreat: the "
+            "service was lost and the arm may be on its way back, after which they are switched off"
+        ),
     ]
     not_stopped: Annotated[
         list[str], Field(description="devices that did not obey the newest stop of a motion, each with the cause")

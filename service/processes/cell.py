@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from service.recording.tap import Tap  # only a recorded cell needs the libraries behind it
 
 CLOSE_TIMEOUT_S = 4.0
+WAY_BACK_S = 10.0  # the arm's way back without a service, and its rest
 SWITCH_S = 0.0005  # interpreter switch interval: the longest that the control thread waits for another thread
 NO_WATCH = ControlWatch(lambda: None)
 log = logging.getLogger(__name__)
@@ -289,29 +290,17 @@ def main() -> None:
     folder = Path(order.folder)
     vigil = Vigil(folder, lifeline, silence_s=order.silence_s)
     _in_background(vigil.keep)
+    way_back_s = WAY_BACK_S if order.service_lost == "retreat" else 0.0
+    _in_background(lambda: _end_with_parent(lifeline, vigil.is_orphan, way_back_s + CLOSE_TIMEOUT_S))
     with Latch(folder / LATCH) as latch:
-        is_orphan = threading.Event()
-        _in_background(lambda: _end_with_parent(lifeline, is_orphan))
-
-        def is_lost() -> bool:
-            return is_orphan.is_set() or vigil.is_alone or vigil.is_blocked
-
-        signals = CellSignals(is_reduced=latch.is_reduced, keeps_power=lambda: latch.keeps_power() and not is_lost())
         try:
-            _run(order, lifeline, lambda: is_lost() or latch.is_set(), signals, is_orphan, vigil)
+            _run(order, lifeline, latch, vigil)
         except CellError as error:
             lifeline.write_line(error_to_line(error))
     kill_own_group()
 
 
-def _run(
-    order: CellOrder,
-    lifeline: Lifeline,
-    is_latched: Callable[[], bool],
-    signals: CellSignals,
-    end: threading.Event,
-    vigil: Vigil,
-) -> None:
+def _run(order: CellOrder, lifeline: Lifeline, latch: Latch, vigil: Vigil) -> None:
     from hal.host import serve
 
     swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
@@ -319,8 +308,8 @@ def _run(
     runs_dir = None if order.runs_dir is None else Path(order.runs_dir)
     runtime = CellRuntime.start(
         cell,
-        is_latched=is_latched,
-        signals=signals,
+        is_latched=lambda: vigil.is_latched(latch),
+        signals=vigil.signals(latch, service_lost=order.service_lost),
         swapped=swapped,
         runs_dir=runs_dir,
         partial=order.partial,
@@ -332,7 +321,7 @@ def _run(
     freeze_loaded()
     vigil.watch(runtime.why_ended, runtime.watch.why_blocked)
     lifeline.write_line("ready")
-    end.wait()
+    vigil.is_orphan.wait()
     vigil.watch(lambda: None)  # from now on the world may end
     runtime.close()
     with contextlib.suppress(OSError):
@@ -344,10 +333,10 @@ def _import_control() -> None:
     from manipulation import Controller  # noqa: F401 - the import is what is wanted
 
 
-def _end_with_parent(lifeline: Lifeline, is_orphan: threading.Event) -> None:
+def _end_with_parent(lifeline: Lifeline, is_orphan: threading.Event, within_s: float) -> None:
     lifeline.wait_for_end()
     is_orphan.set()  # the control thread reads this at its next tick and stops the arm
-    threading.Event().wait(CLOSE_TIMEOUT_S)
+    threading.Event().wait(within_s)
     kill_own_group()  # a driver that hangs in `close` must not keep the process alive
 
 

@@ -8,6 +8,7 @@ import pickle
 from dataclasses import dataclass
 from typing import Any
 
+from hal.config import LossAction
 from hal.errors import CellError
 from service.processes.beat import SILENCE_S
 
@@ -29,6 +30,7 @@ class CellOrder:
     runs_dir: str | None
     partial: bool
     swapped: dict[str, dict[str, Any]]
+    service_lost: LossAction = "stop"
     record: tuple[str, str] | None = None
     silence_s: float = SILENCE_S
 

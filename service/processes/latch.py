@@ -19,9 +19,12 @@ SIZE = 128
 CLEAR = 0x5A  # any other byte, including zero, means latched, so damaged memory cannot release the arm
 LATCHED = 0x01
 HELD = 0x02  # latched, with the drives left on; every other byte switches them off
+BACK = 0x03  # latched because the service is lost, and an arm that moves goes back the way it came
+STRENGTH = (CLEAR, BACK, HELD, LATCHED)  # a stop replaces those before it and never weakens those behind it
 WORD = 8  # bytes
 BODY = struct.Struct("<BQd80s")  # flag, count, wall time, source
 BODY_AT = WORD
+REST = struct.Struct("<Qd80s")  # of the body, behind the flag
 RECORDED_AT = 112  # the count of the newest stop that is in the journal; written by the service
 SPEED_AT = 120  # written by the service
 FULL_SPEED = 0x5A  # any other byte means that people are near, so that damaged memory makes the arm slow
@@ -29,10 +32,11 @@ TRIES = 100
 
 
 class StopLevel(StrEnum):
-    """What a stop does after the arm has come to rest (IEC 60204-1)."""
+    """What a stop does after the arm has come to rest (IEC 60204-1); callers choose between the first two."""
 
     OFF = "off"  # the drives are switched off and the brakes hold the arm (stop category 1)
     HOLD = "hold"  # the drives stay on and hold the arm (stop category 2)
+    RETREAT = "retreat"  # an arm that moved goes back the way it came; then the drives are switched off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +50,9 @@ class LatchState:
     level: StopLevel = StopLevel.OFF
 
 
+FLAGS = {StopLevel.OFF: LATCHED, StopLevel.HOLD: HELD, StopLevel.RETREAT: BACK}
+LEVELS = {flag: level for level, flag in FLAGS.items()}  # every other byte switches off
+WHEN_LOST = {"hold": StopLevel.HOLD, "retreat": StopLevel.RETREAT, "stop": StopLevel.OFF}  # words of the cell file
 UNREADABLE = LatchState(is_latched=True, count=0, time_s=0.0, source="latch not readable")
 
 
@@ -86,10 +93,25 @@ class Latch:
         except ValueError:
             return True
 
+    def has(self, level: StopLevel) -> bool:
+        """Return whether a stop is latched that is at least as strong as one of this level."""
+        try:
+            flag = self._memory[BODY_AT]
+        except ValueError:
+            return True
+        return flag not in STRENGTH or STRENGTH.index(flag) >= STRENGTH.index(FLAGS[level])
+
     def keeps_power(self) -> bool:
         """Return whether the stop is latched in a way that leaves the drives on; never for a closed or damaged latch."""
         try:
             return self._memory[BODY_AT] == HELD
+        except ValueError:
+            return False
+
+    def goes_back(self) -> bool:
+        """Return whether the stop is latched in a way that lets a moving arm go back; never for a closed or damaged latch."""
+        try:
+            return self._memory[BODY_AT] == BACK
         except ValueError:
             return False
 
@@ -115,18 +137,18 @@ class Latch:
                 break
             if before == after and before % 2 == 0:
                 text = source.rstrip(b"\0").decode("utf-8", "replace")
-                level = StopLevel.HOLD if flag == HELD else StopLevel.OFF
+                level = LEVELS.get(flag, StopLevel.OFF)
                 return LatchState(is_latched=flag != CLEAR, count=count, time_s=time_s, source=text, level=level)
         return UNREADABLE
 
     def set(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the stop; always succeeds, also when it is latched already.
 
-        A stop that switches off is never made a weaker one.
+        A stop that switches off is never made a weaker one, and one that holds does not let the arm go back.
         """
         with self._writing:
-            holds = level is StopLevel.HOLD and self._memory[BODY_AT] in (CLEAR, HELD)
-            return self._write(HELD if holds else LATCHED, source)
+            now = self._memory[BODY_AT] if self._memory[BODY_AT] in STRENGTH else LATCHED
+            return self._write(max(FLAGS[level], now, key=STRENGTH.index), source)
 
     def reset(self, source: str, *, seen_count: int) -> bool:
         """Clear the latch unless it was set again after `seen_count`; returns whether it is clear."""
@@ -159,6 +181,7 @@ class Latch:
             self._memory[BODY_AT] = flag  # written first, because the control thread may read it at any time
         _, count, _, _ = BODY.unpack_from(self._memory, BODY_AT)
         text = source.encode("utf-8", "replace")[:80]
-        BODY.pack_into(self._memory, BODY_AT, flag, count + 1, time.time(), text)
+        REST.pack_into(self._memory, BODY_AT + 1, count + 1, time.time(), text)  # its bytes are zero for a moment
+        self._memory[BODY_AT] = flag
         self._sequence[0] = sequence + 1
         return self.state()

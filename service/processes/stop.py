@@ -3,8 +3,9 @@
 This is not a safety function: a machine that can hurt people needs a hardware stop.
 
 Anyone may stop, without a key, a lease or a request body. Only the supervisor can reset, over this process's standard
-input. When the supervisor ends, the process sets the latch and ends. It also sets the latch when the service or the cell
-gives no heartbeat.
+input. When the supervisor ends, the process sets the latch and ends; if the arm then goes back the way it came, the process
+stays until that has ended, so that the arm can be stopped. It also sets the latch when the service or the cell gives no
+heartbeat.
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ from urllib.parse import parse_qs, urlsplit
 from hal.priorities import Priority, take_priority
 from hal.process_state import MOVES, set_memory_priority
 from service.processes.beat import PERIOD_S, SILENCE_S, Beat
-from service.processes.latch import LATCH, Latch, LatchState, StopLevel
+from service.processes.latch import LATCH, WHEN_LOST, Latch, LatchState, StopLevel
 
 MAX_HEAD_BYTES = 65_536  # browsers send the cookies of all pages of this machine, whatever their port
 HEAD_TIMEOUT_S = 2.0
+WAY_BACK_S = 15.0  # the cell of a service that has ended is gone sooner
 RECORD_S = 0.2  # an answer waits no longer for the record of its stop
 MAX_CONNECTIONS = 300  # far fewer than the 1024 files that a process may usually open
 PATH = "/v1/stop"
+GONE = "the service is gone"
 REASONS = {
     200: "OK", 204: "No Content", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed",
 }  # fmt: skip
@@ -194,22 +197,26 @@ class Watchdog:
     Args:
         folder: runtime folder of the service.
         silence_s: see `Beat.lost`.
+        service_lost: what the loss of the service does; that of the cell always switches off.
     """
 
-    def __init__(self, latch: Latch, folder: Path, *, silence_s: float) -> None:
+    def __init__(
+        self, latch: Latch, folder: Path, *, silence_s: float, service_lost: StopLevel = StopLevel.OFF
+    ) -> None:
         self._latch = latch
         self._own = Beat(folder, "stop")
-        self._others = {name: Beat(folder, name) for name in ("service", "cell")}
+        self._others = {
+            "service": (Beat(folder, "service"), service_lost),
+            "cell": (Beat(folder, "cell"), StopLevel.OFF),
+        }
         self._silence_s = silence_s
 
     def look(self) -> None:
-        """Give one heartbeat and look at those of the others once."""
+        """Give one heartbeat and look at those of the others once; a loss is one stop, however long it lasts."""
         self._own.beat()
-        if self._latch.is_set() and not self._latch.keeps_power():
-            return
-        for name, beat in self._others.items():
-            if (why := beat.lost(silence_s=self._silence_s)) is not None:
-                self._latch.set(f"the {name} process {why}")
+        for name, (beat, level) in self._others.items():
+            if not self._latch.has(level) and (why := beat.lost(silence_s=self._silence_s)) is not None:
+                self._latch.set(f"the {name} process {why}", level)
 
     async def run(self) -> None:
         """Look until cancelled."""
@@ -218,7 +225,9 @@ class Watchdog:
             await asyncio.sleep(PERIOD_S)
 
 
-async def _run(listener: socket.socket, latch: Latch, origins: tuple[str, ...], watchdog: Watchdog) -> None:
+async def _run(
+    listener: socket.socket, latch: Latch, origins: tuple[str, ...], watchdog: Watchdog, service_lost: StopLevel
+) -> None:
     server = await StopServer(latch, origins).start(listener)
     watchdog.look()
     watching = asyncio.create_task(watchdog.run())
@@ -229,9 +238,20 @@ async def _run(listener: socket.socket, latch: Latch, origins: tuple[str, ...], 
     sys.stdout.flush()
     while line := await commands.readline():
         obey(latch, line.decode("utf-8", "replace"))
-    latch.set("the service is gone")
+    if service_lost is StopLevel.RETREAT:
+        latch.set(GONE, service_lost)
+        await _end_of_way_back(latch)
+    latch.set(GONE)
     watching.cancel()
     server.close()
+
+
+async def _end_of_way_back(latch: Latch) -> None:
+    """Return when somebody has stopped the arm, or its cell has ended, which the watchdog notices, or after a bounded time."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(WAY_BACK_S):
+            while latch.goes_back():  # noqa: ASYNC110 - in shared memory
+                await asyncio.sleep(PERIOD_S)
 
 
 def main() -> None:
@@ -240,14 +260,16 @@ def main() -> None:
     parser.add_argument("--fd", type=int, required=True, help="bound listening socket")
     parser.add_argument("--folder", type=Path, required=True, help="runtime folder of the service")
     parser.add_argument("--silence", type=float, default=SILENCE_S, help="see Beat.lost")
+    parser.add_argument("--service-lost", default="stop", choices=list(WHEN_LOST), help="see the cell file")
     parser.add_argument("--origin", action="append", default=[])
     options = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     take_priority(Priority.STOP)
     set_memory_priority(MOVES)
     with Latch(options.folder / LATCH) as latch, socket.socket(fileno=options.fd) as listener:
-        watchdog = Watchdog(latch, options.folder, silence_s=options.silence)
-        asyncio.run(_run(listener, latch, tuple(options.origin), watchdog))
+        lost = WHEN_LOST[options.service_lost]
+        watchdog = Watchdog(latch, options.folder, silence_s=options.silence, service_lost=lost)
+        asyncio.run(_run(listener, latch, tuple(options.origin), watchdog, lost))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from hal.config import LossAction
 from hal.errors import ConfigError, MotionRefused
 from service.processes.beat import SILENCE_S, Beat
 from service.processes.child import Child
@@ -91,6 +92,7 @@ class ProcessStop:
         folder: runtime folder of the service, with the latch and the heartbeats.
         report: called for each loss of the process.
         silence_s: see `Beat.lost`.
+        service_lost: what the process does when it loses this one; see the cell file.
     """
 
     def __init__(
@@ -102,6 +104,7 @@ class ProcessStop:
         *,
         report: Callable[[str, dict[str, Any]], None],
         silence_s: float = SILENCE_S,
+        service_lost: LossAction = "stop",
     ) -> None:
         self._latch = latch
         self._folder = folder
@@ -111,6 +114,7 @@ class ProcessStop:
         self._short_lives = 0
         self._listener = listener if listener is not None else _any_port()
         self._origins = origins
+        self._service_lost = service_lost
         self._report = report
         self._restarts = 0
         self._is_closing = threading.Event()
@@ -187,7 +191,7 @@ class ProcessStop:
 
     def _begin(self) -> Child:
         arguments = ["--fd", str(self._listener.fileno()), "--folder", str(self._folder)]
-        arguments += ["--silence", str(self._silence_s)]
+        arguments += ["--silence", str(self._silence_s), "--service-lost", self._service_lost]
         for origin in self._origins:
             arguments += ["--origin", origin]
         return Child(

@@ -98,10 +98,11 @@ class Supervisor:
         self._own_beat, self._cell_beat = Beat(self.folder, "service"), Beat(self.folder, "cell")
         self._own_beat.beat()
         self._end_of_pauses = pauses.tell(self._own_beat.pause)
+        lost = cell.file.safety.service_lost
         self._stop: StopHost = (
             InlineStop(self.latch, stop_listener, origins)
             if inline
-            else ProcessStop(self.latch, self.folder, stop_listener, origins, report=records.note)
+            else ProcessStop(self.latch, self.folder, stop_listener, origins, report=records.note, service_lost=lost)
         )
         self._remote = RemoteConnection(cell)
         self._local: LocalConnection | None = None
@@ -309,6 +310,7 @@ class Supervisor:
             authkey=secrets.token_hex(32),
             runs_dir=None if self._runs_dir is None else str(self._runs_dir.absolute()),
             partial=self._partial,
+            service_lost=self.cell.file.safety.service_lost,
             swapped={name: section.model_dump(mode="json") for name, section in self._swapped.items()},
             record=None if self._record is None else (self._record.address, self._record.key),
         )

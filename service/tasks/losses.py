@@ -1,7 +1,8 @@
 """What happens when a motion loses its client or a device: hold, go back the way it came, or stop and switch off.
 
-The cell file chooses (`[safety]`: `client_lost`, `device_lost`, `wrench_lost`). The loss of the arm itself, of the service, the
-cell or the stop process always stops and switches off: nothing is left that could move the arm with care.
+The cell file chooses (`[safety]`: `client_lost`, `device_lost`, `wrench_lost`). For the loss of the service itself
+(`service_lost`) the cell does the same without it. The loss of the arm, the cell or the stop process always stops and switches
+off: nothing is left that could move the arm with care.
 """
 
 from __future__ import annotations
@@ -11,21 +12,13 @@ import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 
-import numpy as np
-
-from hal.arrays import Array
 from hal.config import Cell, LossAction
 from hal.devices import DeviceKind
 from hal.errors import CellError
 from hal.motion import JointTrajectory, MotionLimits, MotionOutcome, MotionReport, Mover
+from manipulation import Trail
 
-BACK_M = 0.10  # of the tip; further away nothing is touched any more
-BACK_M_PER_S = 0.05
-BACK_RAD_PER_S = 0.3
-THIN_RAD = 0.01  # between two points of the way back
-TRAIL_MOTIONS = 20
 log = logging.getLogger(__name__)
 
 
@@ -64,8 +57,8 @@ class Losses:
 
         def after(report: MotionReport, mover: Mover, limits: MotionLimits) -> None:
             trail.add(report)
-            if self._action(task, report) == "retreat" and (motion := trail.way_back()) is not None:
-                self._go_back(replace(motion, limits=limits), mover, check)
+            if self._action(task, report) == "retreat" and (motion := trail.way_back(limits)) is not None:
+                self._go_back(motion, mover, check)
 
         return after
 
@@ -97,54 +90,3 @@ class Losses:
         finally:
             with self._lock:
                 self._is_going_back = False
-
-
-class Trail:
-    """The way of the arm in the motions of a task, the newest last."""
-
-    def __init__(self) -> None:
-        self._logs: deque[tuple[Array, Array]] = deque(maxlen=TRAIL_MOTIONS)
-        self._here_rad: Array | None = None
-
-    def add(self, report: MotionReport) -> None:
-        """Note the way of a motion."""
-        self._logs.append((report.log.positions_rad, report.log.tip_m))
-        self._here_rad = report.position_rad
-
-    def way_back(self) -> JointTrajectory | None:
-        """Return a slow motion back along the trail, at most `BACK_M` of the tip; None when the arm has not moved.
-
-        It needs the arm only, and the force limit of a transfer ends it.
-        """
-        path, times_s = [np.asarray(self._here_rad, float)], [0.0]
-        gone_m = 0.0
-        last_m: Array | None = None
-        for positions_rad, tips_m in reversed(self._logs):
-            for q, tip_m in zip(positions_rad[::-1], tips_m[::-1], strict=True):
-                far_rad = float(np.abs(q - path[-1]).max())
-                if last_m is None:
-                    last_m = tip_m
-                if far_rad < THIN_RAD:
-                    continue
-                step_m = float(np.linalg.norm(tip_m - last_m))
-                gone_m, last_m = gone_m + step_m, tip_m
-                if gone_m > BACK_M:
-                    return _slowly(path, times_s)
-                path.append(np.asarray(q, float))
-                times_s.append(times_s[-1] + max(step_m / BACK_M_PER_S, far_rad / BACK_RAD_PER_S))
-        return _slowly(path, times_s)
-
-
-def _slowly(path: list[Array], times_s: list[float]) -> JointTrajectory | None:
-    if len(path) < 2:
-        return None
-    positions, times = np.array(path), np.array(times_s)
-    velocities = np.zeros_like(positions)
-    velocities[1:-1] = (positions[2:] - positions[:-2]) / (times[2:] - times[:-2])[:, None]
-    return JointTrajectory(
-        name="back the way it came",
-        times_s=times,
-        positions_rad=positions,
-        velocities_rad_per_s=velocities,
-        is_retreat=True,
-    )

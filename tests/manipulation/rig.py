@@ -224,13 +224,14 @@ class Rig:
     latched: list[bool]
     near: list[bool] = field(default_factory=lambda: [False])  # whether people are
     held: list[bool] = field(default_factory=lambda: [False])  # whether a stop leaves the drives on
+    back: list[bool] = field(default_factory=lambda: [False])  # whether a stop lets the arm go back
 
 
 def make_rig(
     *, force_limit_n: float = 100.0, speed_limit_m_per_s: float = 0.25, safety: SafetySection | None = None
 ) -> Rig:
     """Return a started controller; the caller must close `rig.controller`."""
-    world, latched, near, held = World(), [False], [False], [False]
+    world, latched, near, held, back = World(), [False], [False], [False], [False]
     controller = Controller(
         MotionDevices(
             arm=FakeArm("arm", world),
@@ -244,12 +245,12 @@ def make_rig(
         load=LOAD,
         flange_from_sensor=SENSOR,
         is_latched=lambda: latched[0],
-        signals=CellSignals(is_reduced=lambda: near[0], keeps_power=lambda: held[0]),
+        signals=CellSignals(is_reduced=lambda: near[0], keeps_power=lambda: held[0], goes_back=lambda: back[0]),
         flange_from_grip=GRIP,
         rate_hz=500.0,
     )
     controller.start()
-    return Rig(world, controller, latched, near, held)
+    return Rig(world, controller, latched, near, held, back)
 
 
 def tool_pose(q: np.ndarray) -> RigidTransform:

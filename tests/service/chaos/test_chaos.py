@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from service.chaos.options import ChaosOptions, Round
 from service.chaos.plant import Plant
 from service.chaos.run import Chaos
 from service.chaos.table import report, write
-from service.chaos.watch import REST_S, STILL_RAD, Sight, motions_while_latched
+from service.chaos.watch import BACK_S, REST_S, STILL_RAD, Sight, motions_while_latched
 from service.tasks.journal_reader import Record
 from tests.service.conftest import WriteCell
 
@@ -60,6 +61,12 @@ def test_a_motion_under_a_latched_stop_is_found_once_the_arm_had_time_to_rest() 
         sights((0.0, None, 0.0), (late, None, 1.0), (2 * late, None, 2.0)),
     ):
         assert motions_while_latched(still) == []
+
+
+def test_an_arm_that_may_go_back_has_longer_to_come_to_rest() -> None:
+    late = REST_S + 0.1
+    moved = sights((0.0, "a", 0.0), (late, "a", 0.5), (late + 1, "a", 0.5 + 2 * STILL_RAD))
+    assert motions_while_latched([replace(sight, rest_s=REST_S + BACK_S) for sight in moved]) == []
 
 
 def test_a_signal_that_the_service_would_inherit_as_ignored_is_not_chosen() -> None:

@@ -37,7 +37,8 @@ from hal.registry import Context
 from hal.simulated import Fault
 
 # immortal: continues to work after `close`. trouble: a file with `crash` or `away`, in effect while it exists
-OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal", "trouble"}
+# trace: a file that gets the first joint's set-points of an arm, and `stop`
+OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal", "trouble", "trace"}
 
 
 class FakeDevice:
@@ -122,6 +123,7 @@ class FakeArm(FakeDevice):
     def __init__(self, context: Context, options: dict[str, Any]) -> None:
         super().__init__(context, options)
         self._q = np.array([0.0, -1.2, 1.6, 0.0, 0.8, 0.0])
+        self._trace = Path(options.get("trace", "/dev/null"))
 
     def capabilities(self) -> ArmCapabilities:
         d = (0.40, 0.0, 0.0, 0.40, 0.0, 0.08)
@@ -144,13 +146,18 @@ class FakeArm(FakeDevice):
 
     def command_position(self, position_rad: Any, *, deadline: Deadline) -> Any:
         self._q = np.asarray(position_rad, float).copy()
+        self._note(f"{self._q[0]:.6f}")
         return self._q.copy()
 
     def enable(self, *, deadline: Deadline) -> None:
         pass
 
     def stop(self, *, deadline: Deadline) -> None:
-        pass
+        self._note("stop")
+
+    def _note(self, line: str) -> None:
+        with self._trace.open("a") as file:
+            file.write(f"{line}\n")
 
 
 class FakeGripper(FakeDevice):

@@ -147,6 +147,30 @@ def test_the_stop_process_latches_for_each_process_that_is_lost(tmp_path: Path, 
     assert latch.state().count == count, "one loss is one stop"
 
 
+@pytest.mark.parametrize(("name", "level"), [("service", StopLevel.RETREAT), ("cell", StopLevel.OFF)])
+def test_the_cell_file_chooses_what_the_loss_of_the_service_does_and_no_more(
+    tmp_path: Path, name: str, level: StopLevel
+) -> None:
+    latch, beat = Latch.create(tmp_path / "latch"), Beat(tmp_path, name)
+    watchdog = Watchdog(latch, tmp_path, silence_s=0.0, service_lost=StopLevel.RETREAT)
+    latch.reset("test", seen_count=latch.state().count)
+    beat.beat()
+    eventually(lambda: (watchdog.look(), latch.is_set())[1])
+    count = latch.state().count
+    watchdog.look()
+    assert (latch.state().level, latch.state().count) == (level, count)
+
+
+def test_the_loss_of_the_cell_ends_the_way_back_of_an_arm_without_its_service(tmp_path: Path) -> None:
+    latch, service, cell = Latch.create(tmp_path / "latch"), Beat(tmp_path, "service"), Beat(tmp_path, "cell")
+    watchdog = Watchdog(latch, tmp_path, silence_s=0.0, service_lost=StopLevel.RETREAT)
+    latch.reset("test", seen_count=latch.state().count)
+    service.beat()
+    eventually(lambda: (watchdog.look(), latch.goes_back())[1])
+    cell.beat()
+    eventually(lambda: (watchdog.look(), latch.has(StopLevel.OFF))[1])
+
+
 def test_the_loss_of_a_process_makes_a_stop_that_holds_one_that_switches_off(tmp_path: Path) -> None:
     latch, beat = Latch.create(tmp_path / "latch"), Beat(tmp_path, "service")
     watchdog = Watchdog(latch, tmp_path, silence_s=0.0)

@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import json
 import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -14,8 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from service.processes.latch import BODY_AT, CLEAR, FULL_SPEED, HELD, SIZE, SPEED_AT, Latch, StopLevel
+from service.processes.latch import BACK, BODY_AT, CLEAR, FULL_SPEED, HELD, SIZE, SPEED_AT, Latch, StopLevel
 from service.processes.stop import StopServer, obey
+from tests.service.waiting import eventually
 
 
 def test_a_new_latch_is_latched(tmp_path: Path) -> None:
@@ -106,6 +109,52 @@ def test_readers_never_see_a_mixed_record(tmp_path: Path) -> None:
         writer.join()
 
 
+@pytest.mark.parametrize("first", StopLevel)
+@pytest.mark.parametrize("second", StopLevel)
+def test_a_stop_replaces_a_weaker_one_and_never_weakens_one(
+    tmp_path: Path, first: StopLevel, second: StopLevel
+) -> None:
+    latch = Latch.create(tmp_path / "latch")
+    latch.reset("test", seen_count=latch.state().count)
+    assert not any(latch.has(level) for level in StopLevel)
+    latch.set("first", first)
+    strength = [StopLevel.RETREAT, StopLevel.HOLD, StopLevel.OFF]
+    assert [latch.has(level) for level in strength] == [n <= strength.index(first) for n in range(3)]
+    held = max(first, second, key=strength.index)
+    assert latch.set("second", second).level is held
+    assert (latch.keeps_power(), latch.goes_back()) == (held is StopLevel.HOLD, held is StopLevel.RETREAT)
+
+
+def test_a_damaged_or_closed_latch_keeps_no_power_and_lets_no_arm_go_back(tmp_path: Path) -> None:
+    path = tmp_path / "latch"
+    latch = Latch.create(path)
+    memory = bytearray(path.read_bytes())
+    memory[BODY_AT] = 0
+    path.write_bytes(bytes(memory))
+    for level in StopLevel:
+        assert Latch(path).set("later", level).level is StopLevel.OFF
+    assert latch.has(StopLevel.OFF)
+    latch.close()
+    assert latch.has(StopLevel.OFF) and not latch.keeps_power() and not latch.goes_back()
+
+
+def test_no_reader_in_another_process_sees_a_stop_that_holds_as_another_one(tmp_path: Path) -> None:
+    code = (
+        "import pathlib, sys; from service.processes.latch import Latch, StopLevel\n"
+        "latch = Latch(pathlib.Path(sys.argv[1]))\n"
+        "while True: latch.set('again', StopLevel.HOLD)"
+    )
+    latch = Latch.create(tmp_path / "latch")
+    latch.reset("test", seen_count=latch.state().count)
+    latch.set("hold", StopLevel.HOLD)
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "latch")]) as writer:
+        begun = latch.state().count
+        eventually(lambda: latch.state().count > begun + 10)
+        seen = {latch.keeps_power() for _ in range(500_000)}
+        writer.kill()
+    assert seen == {True}, "the drives would be switched off"
+
+
 class LatchLife(RuleBasedStateMachine):
     """Stops and resets in any order, compared with a simple model."""
 
@@ -194,7 +243,7 @@ def test_a_damaged_or_closed_latch_switches_off_and_makes_the_arm_slow(tmp_path:
     assert not latch.is_reduced()
     obey(latch, "hold a good reason\n")
     assert (latch.is_set(), latch.keeps_power(), latch.state().level) == (True, True, StopLevel.HOLD)
-    for byte in {*range(256)} - {HELD, CLEAR}:
+    for byte in {*range(256)} - {BACK, HELD, CLEAR}:
         latch._memory[BODY_AT] = byte
         assert latch.is_set() and not latch.keeps_power()
         latch.set("a person", StopLevel.HOLD)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -14,7 +15,10 @@ import pytest
 
 from hal.child_python import module_command
 from hal.errors import MotionRefused
-from service.processes.latch import Latch
+from manipulation.control.way_back import LONGEST_S
+from service.processes import cell, stop
+from service.processes.beat import Beat, every_beat
+from service.processes.latch import Latch, StopLevel
 from service.processes.stop_host import ProcessStop, bound_socket
 from tests.service.waiting import eventually
 
@@ -69,6 +73,7 @@ def test_a_reset_that_is_obeyed_too_late_clears_nothing_for_a_moment(
     latch: Latch, host: ProcessStop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each change of the latch raises its count, so that a clear moment in between would show in it."""
+    monkeypatch.setattr("service.processes.stop_host.STOP_ANSWER_S", 60.0)  # so that only the process answers
     seen = host.stop("a person").count
     os.kill(_pid(host), signal.SIGSTOP)
     monkeypatch.setattr("service.processes.stop_host.RESET_ANSWER_S", 0.05)
@@ -81,9 +86,11 @@ def test_a_reset_that_is_obeyed_too_late_clears_nothing_for_a_moment(
     assert latch.state().count == held + 1
 
 
-def test_a_stop_process_without_its_supervisor_latches_and_ends(latch: Latch, tmp_path: Path) -> None:
+@contextlib.contextmanager
+def _orphan(latch: Latch, folder: Path, service_lost: str) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket]]:
+    """Yield a stop process whose supervisor has ended, and its port."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        arguments = ["--fd", str(listener.fileno()), "--folder", str(tmp_path)]
+        arguments = ["--fd", str(listener.fileno()), "--folder", str(folder), "--service-lost", service_lost]
         process = subprocess.Popen(
             module_command("service.processes.stop", *arguments),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[listener.fileno()],
@@ -92,10 +99,43 @@ def test_a_stop_process_without_its_supervisor_latches_and_ends(latch: Latch, tm
         assert process.stdout.readline() == b"ready\n"
         assert not latch.is_set()
         process.stdin.close()  # as when the process that holds the other end is killed
-        eventually(lambda: process.poll() is not None)
+        yield process, listener
         process.stdout.close()
+
+
+@pytest.mark.parametrize("service_lost", ["hold", "stop"])
+def test_a_stop_process_without_its_supervisor_latches_and_ends(
+    latch: Latch, tmp_path: Path, service_lost: str
+) -> None:
+    with _orphan(latch, tmp_path, service_lost) as (process, _):
+        eventually(lambda: process.poll() is not None)
     assert latch.is_set()
-    assert latch.state().source == "the service is gone"
+    assert (latch.state().source, latch.state().level) == ("the service is gone", StopLevel.OFF)
+
+
+def test_an_arm_that_goes_back_without_a_service_can_be_stopped(latch: Latch, tmp_path: Path) -> None:
+    with _orphan(latch, tmp_path, "retreat") as (process, listener):
+        eventually(latch.goes_back)
+        with socket.create_connection(listener.getsockname()) as person:
+            person.sendall(b"POST /v1/stop HTTP/1.1\r\n\r\n")
+            assert person.recv(100).startswith(b"HTTP/1.1 200")
+        assert latch.has(StopLevel.OFF)
+        eventually(lambda: process.poll() is not None)
+
+
+def test_the_stop_process_of_an_arm_that_goes_back_ends_with_its_cell(latch: Latch, tmp_path: Path) -> None:
+    cell = Beat(tmp_path, "cell")
+    ended = every_beat(cell.beat, name="cell")
+    with _orphan(latch, tmp_path, "retreat") as (process, _):
+        eventually(latch.goes_back)
+        assert process.poll() is None
+        ended.set()  # no thread of this process gives its heartbeat any more
+        eventually(lambda: process.poll() is not None)
+    assert latch.state().level is StopLevel.OFF
+
+
+def test_a_stop_process_waits_longer_for_a_way_back_than_one_takes() -> None:
+    assert LONGEST_S < cell.WAY_BACK_S < cell.WAY_BACK_S + cell.CLOSE_TIMEOUT_S < stop.WAY_BACK_S
 
 
 def test_answers_do_not_wait_for_the_acknowledgement_of_their_first_packet() -> None:

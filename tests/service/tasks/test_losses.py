@@ -13,8 +13,10 @@ import pytest
 from hal.config import Cell, load_cell
 from hal.errors import Stopped
 from hal.motion import Hold, MotionLimits, MotionOutcome, MotionReport
+from manipulation.control.termination import SETTLED_RAD_PER_S
+from manipulation.control.way_back import BACK_M
 from service.tasks.gate import GatedMover
-from service.tasks.losses import BACK_M, Losses
+from service.tasks.losses import Losses
 from tests.manipulation.control.test_controller import forwards
 from tests.manipulation.rig import Rig, make_rig, tool_pose
 from tests.service.conftest import WriteCell
@@ -83,7 +85,7 @@ def test_a_motion_without_its_client_holds_goes_back_or_is_switched_off(
     else:
         assert report.outcome is MotionOutcome.CANCELLED and scene.stopped == [] and rig.world.enabled
     assert (scene.gone_m() < 0.002) == (action == "retreat")
-    assert np.abs(rig.world.velocity).max() < 1e-2
+    assert np.abs(rig.world.velocity).max() < SETTLED_RAD_PER_S
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,9 @@ import re
 import secrets
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -68,6 +69,42 @@ class _File(Strict):
     keys: tuple[Key, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Keys:
+    """The keys at one moment, by which a whole request is judged.
+
+    Attributes:
+        stored: those of the file.
+        by_hash: those of the file and of this program.
+        now_s: wall time, which decides only whether a key has expired.
+    """
+
+    stored: tuple[Key, ...]
+    by_hash: Mapping[str, Key]
+    now_s: float
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is no key at all, so that everybody on this machine may use the service."""
+        return not self.stored
+
+    def active(self) -> tuple[Key, ...]:
+        """Return the stored keys that are neither revoked nor expired."""
+        return tuple(key for key in self.stored if key.is_active(self.now_s))
+
+    def find(self, secret: str) -> Key | None:
+        """Return the active key with this secret, or None."""
+        digest = _hash(secret)
+        key = self.by_hash.get(digest)
+        if key is None or not hmac.compare_digest(key.sha256, digest) or not key.is_active(self.now_s):
+            return None
+        return key
+
+    def named(self, name: str) -> Key | None:
+        """Return the active key with this name, or None."""
+        return next((key for key in self.active() if key.name == name), None)
+
+
 class KeyBook:
     """The keys of one service, read again whenever their file has changed.
 
@@ -83,12 +120,16 @@ class KeyBook:
         self._now = now
         self._stamp: tuple[int, ...] | None = None
         self._keys: tuple[Key, ...] = ()
-        self._by_hash: dict[str, Key] = {}
         self._had_keys = False
         self._own_secret = _new_secret()
         self._own = Key(name=OWN, role=Role.MAINTAINER, sha256=_hash(self._own_secret), added_s=now())
         self._gateway_secret = _new_secret()
         self._gateway = Key(name=GATEWAY, role=Role.OBSERVER, sha256=_hash(self._gateway_secret), added_s=now())
+        self._by_hash = self._hashes()
+
+    def now(self) -> Keys:
+        """Return the keys as they are now; the file is asked once. Errors as for `all`."""
+        return Keys(stored=self.all(), by_hash=self._by_hash, now_s=self._now())
 
     def all(self) -> tuple[Key, ...]:
         """Return all keys, also revoked and expired ones.
@@ -114,11 +155,11 @@ class KeyBook:
     @property
     def is_open(self) -> bool:
         """Whether there is no key at all, so that everybody on this machine may use the service."""
-        return not self.all()
+        return self.now().is_open
 
     def active(self) -> tuple[Key, ...]:
         """Return the keys that are neither revoked nor expired."""
-        return tuple(key for key in self.all() if key.is_active(self._now()))
+        return self.now().active()
 
     def own(self) -> str:
         """Return the key for this program's own clients, which is kept in memory only and ends with the program."""
@@ -130,17 +171,11 @@ class KeyBook:
 
     def find(self, secret: str) -> Key | None:
         """Return the active key with this secret, or None."""
-        self.all()
-        digest = _hash(secret)
-        ours = {one.sha256: one for one in (self._own, self._gateway)}
-        key = ours.get(digest) or self._by_hash.get(digest)
-        if key is None or not hmac.compare_digest(key.sha256, digest) or not key.is_active(self._now()):
-            return None
-        return key
+        return self.now().find(secret)
 
     def named(self, name: str) -> Key | None:
         """Return the active key with this name, or None."""
-        return next((key for key in self.active() if key.name == name), None)
+        return self.now().named(name)
 
     def add(self, name: str, role: Role, *, valid_s: float | None, commit: Commit) -> str:
         """Add a key and return its secret, which nothing can show again.
@@ -196,8 +231,11 @@ class KeyBook:
                 f"the file of keys {self.path} cannot be read: {type(error).__name__}",
                 hint="restore it from a backup, or delete it and add keys again",
             ) from error
-        self._by_hash = {key.sha256: key for key in self._keys}
+        self._by_hash = self._hashes()
         self._had_keys = self._had_keys or bool(self._keys)
+
+    def _hashes(self) -> dict[str, Key]:
+        return {key.sha256: key for key in (*self._keys, self._own, self._gateway)}
 
     def _write(self, keys: tuple[Key, ...]) -> None:
         write_atomically(self.path, _File(keys=keys).model_dump_json(indent=1) + "\n", mode=MODE)

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from service.access.keys import Key, KeyBook
+from service.access.keys import Key, Keys
 
 SESSION_S = 12 * 3600.0
 MAX_SESSIONS = 1000
@@ -44,7 +44,7 @@ class Sessions:
                 self._sessions.popitem(last=False)
         return token
 
-    def find(self, token: str, book: KeyBook) -> Key | None:
+    def find(self, token: str, keys: Keys) -> Key | None:
         """Return the key of a session; None when the session has ended, or its key was revoked, replaced or expired."""
         with self._lock:
             session = self._sessions.get(token)
@@ -53,7 +53,7 @@ class Sessions:
                 return None
         if session is None:
             return None
-        key = book.named(session.key_name)
+        key = keys.named(session.key_name)
         return key if key is not None and key.sha256 == session.key_hash else None
 
     def close(self, token: str) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import ipaddress
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
-from fastapi import WebSocketException
+from fastapi import Depends, WebSocketException
 from starlette.requests import HTTPConnection
 
 from service.access.actor import act_as
-from service.access.keys import Role
+from service.access.keys import Keys, Role
 from service.errors import Forbidden, KeysUnusable, Unauthenticated
 from service.http.guard import PROXIED
 from service.http.permissions import row_of
@@ -21,10 +23,11 @@ HOW = "send `Authorization: Bearer KEY`, or log in at /login.html"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caller:
-    """Who asks: the name and role of a key. `name` is None while the service has no keys."""
+    """Who asks: name, role and hash of a key. `name` is None while the service has no keys."""
 
     name: str | None
     role: Role
+    key_hash: str = ""
 
 
 ANYBODY = Caller(name=None, role=Role.MAINTAINER)
@@ -74,37 +77,57 @@ def caller_of(state: AppState, connection: HTTPConnection) -> Caller | None:
         Unauthenticated: the key or the session is not valid, or a page of another origin used the session.
         KeysUnusable: the file of keys cannot be used.
     """
-    book = state.service.keys
-    if book.is_open:
+    keys = state.service.keys.now()
+    if keys.is_open:
         return ANYBODY
     header = connection.headers.get("authorization")
     if header is not None:
         scheme, _, secret = header.partition(" ")
         if scheme.lower() != "bearer":
             raise Unauthenticated("the Authorization header is not a bearer key", hint=HOW)
-        return caller_with(state, secret.strip())
+        return caller_with(keys, secret.strip())
     token = connection.cookies.get(state.cookie)
     if token is None:
         return None
     is_writing = connection.scope["type"] == "websocket" or connection.scope["method"] not in ("GET", "HEAD")
     if is_writing and connection.headers.get("origin") not in state.origins:  # the guard lets a missing origin pass
         raise Unauthenticated("a session is valid only for the page of this service", hint=HOW)
-    key = state.sessions.find(token, book)
+    key = state.sessions.find(token, keys)
     if key is None:
         raise Unauthenticated("the session has ended", hint="log in again at /login.html")
-    return Caller(name=key.name, role=key.role)
+    return Caller(name=key.name, role=key.role, key_hash=key.sha256)
 
 
-def caller_with(state: AppState, secret: str) -> Caller:
+def caller_with(keys: Keys, secret: str) -> Caller:
     """Return the caller with this key.
 
     Raises:
         Unauthenticated: no active key has this secret.
     """
-    key = state.service.keys.find(secret)
+    key = keys.find(secret)
     if key is None:
         raise Unauthenticated("the key is not valid: unknown, revoked or expired", hint="ask for a new key")
-    return Caller(name=key.name, role=key.role)
+    return Caller(name=key.name, role=key.role, key_hash=key.sha256)
+
+
+def is_valid_still(state: AppState, caller: Caller) -> bool:
+    """Return whether a stream that this caller began may tell more: its key was neither revoked nor has it expired."""
+    try:
+        keys = state.service.keys.now()
+    except KeysUnusable:
+        return False
+    key = keys.by_hash.get(caller.key_hash)
+    return keys.is_open if caller.name is None else key is not None and key.is_active(keys.now_s)
+
+
+async def still_may(connection: HTTPConnection) -> Callable[[], bool]:
+    """Return what a stream asks before it tells something; a dependency."""
+    state: AppState = connection.app.state.panelwright
+    caller: Caller = connection.state.caller
+    return lambda: is_valid_still(state, caller)
+
+
+StillMay = Annotated[Callable[[], bool], Depends(still_may)]
 
 
 def is_here(connection: HTTPConnection) -> bool:

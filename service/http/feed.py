@@ -17,6 +17,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request
 from pydantic import BaseModel, Field
 from starlette.responses import Response, StreamingResponse
 
+from service.http.access import StillMay
 from service.http.history import HistoryReading, reading_view
 from service.http.hub import Hub
 from service.http.problems import RESPONSES
@@ -208,6 +209,7 @@ async def follow_feed(
 )
 async def stream_feed(
     desk: Desk,
+    may: StillMay,
     readings_after: After = None,
     alarms_after: After = None,
     last_event_id: Annotated[
@@ -219,15 +221,17 @@ async def stream_feed(
         reading, _, alarm = last_event_id.partition("-")
         begin = Place(int(reading), int(alarm))
     first = await desk.ask(begin, wait_s=0.0)  # an error is an answer, not an empty stream
-    return StreamingResponse(_events(desk, first), media_type="text/event-stream")
+    return StreamingResponse(_events(desk, first, may), media_type="text/event-stream")
 
 
-async def _events(desk: FeedDesk, first: Found) -> AsyncIterator[bytes]:
+async def _events(desk: FeedDesk, first: Found, may: Callable[[], bool]) -> AsyncIterator[bytes]:
     """Yield what was found and all that comes later; the first event also tells where the stream begins."""
     found = first
     yield _event(found)
     while not desk.is_closing:
         found = await desk.ask(found.next, wait_s=ALIVE_S)
+        if not may():
+            return
         yield _event(found) if found.is_news else b":\n\n"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+from collections.abc import Callable
 from typing import Any
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
@@ -13,7 +14,7 @@ from hal.errors import CellError
 from hal.geometry import to_json
 from hal.motion import RobotState
 from service.access.keys import Role
-from service.http.access import caller_with, check_role
+from service.http.access import POLICY_VIOLATION, Caller, caller_with, check_role, is_valid_still
 from service.http.state import AppState, socket_state
 from service.jsonable import jsonable
 
@@ -92,13 +93,14 @@ async def stream(socket: WebSocket) -> None:
         await socket.close(1013, "too many listeners")
         return
     await socket.accept()
-    if socket.state.caller is None and not await _has_sent_key(socket, state):
+    caller: Caller | None = socket.state.caller or await _by_first_message(socket, state)
+    if caller is None:
         return
     mailbox = sampler.join()
     watch = asyncio.create_task(_until_gone(socket))
     try:
         while not state.hub.is_closing and not watch.done():
-            await _forward(socket, mailbox)
+            await _forward(socket, mailbox, lambda: is_valid_still(state, caller))
         await socket.close(1001)
     except (WebSocketDisconnect, RuntimeError):
         pass  # the listener has left
@@ -107,27 +109,31 @@ async def stream(socket: WebSocket) -> None:
         watch.cancel()
 
 
-async def _has_sent_key(socket: WebSocket, state: AppState) -> bool:
-    """Read the key from a listener's first message, `{"key": "..."}`; close the socket and return False without one."""
+async def _by_first_message(socket: WebSocket, state: AppState) -> Caller | None:
+    """Return whose key a listener's first message has, `{"key": "..."}`; close the socket and return None without one."""
     try:
         message = await asyncio.wait_for(socket.receive_json(), FIRST_MESSAGE_S)
         secret = message.get("key") if isinstance(message, dict) else None
-        check_role(caller_with(state, secret if isinstance(secret, str) else ""), Role.OBSERVER)
+        caller = caller_with(state.service.keys.now(), secret if isinstance(secret, str) else "")
+        check_role(caller, Role.OBSERVER)
     except WebSocketDisconnect:
-        return False
+        return None
     except (CellError, TimeoutError, ValueError, KeyError):  # not JSON, or no text message
         await socket.close(1008, "this service needs a key, in the header or as the first message")
-        return False
-    return True
+        return None
+    return caller
 
 
-async def _forward(socket: WebSocket, mailbox: asyncio.Queue[str]) -> None:
+async def _forward(socket: WebSocket, mailbox: asyncio.Queue[str], may: Callable[[], bool]) -> None:
     try:
         async with asyncio.timeout(0.5):
             text = await mailbox.get()
-        await socket.send_text(text)
     except TimeoutError:
         return
+    if not may():
+        await socket.close(POLICY_VIOLATION, "the key of this listener is not valid any more")
+        raise WebSocketDisconnect(POLICY_VIOLATION)
+    await socket.send_text(text)
 
 
 async def _until_gone(socket: WebSocket) -> None:

@@ -12,6 +12,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.responses import FileResponse
 
 from service.access.actor import actor
+from service.http.access import StillMay
 from service.http.models import TaskList, TaskView, event_data
 from service.http.problems import RESPONSES
 from service.http.state import Admitted, AppState, LeaseToken, State
@@ -85,6 +86,7 @@ async def _watched(state: State, task_id: TaskId) -> Task:
 async def watch_task(
     state: State,
     task: Annotated[Task, Depends(_watched)],
+    may: StillMay,
     last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", max_length=20)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     seen = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
@@ -92,6 +94,8 @@ async def watch_task(
         while True:
             changed.clear()
             is_over = task.state.is_final or state.hub.is_closing  # read before the events, so that none is missed
+            if not may():
+                return
             for event in task.events_after(seen):
                 seen = event.sequence
                 yield ServerSentEvent(id=str(seen), event=event.kind, data=event_data(event))

@@ -68,6 +68,23 @@ def test_a_key_expires_and_can_be_revoked(kept: Book) -> None:
         kept.revoke("bob")
 
 
+def test_a_request_is_judged_by_the_file_as_it_was_at_one_moment(kept: Book) -> None:
+    secret = kept.add("alice")
+
+    class Counted(type(kept.path)):  # type: ignore[misc]
+        asked = 0
+
+        def stat(self, *, follow_symlinks: bool = True) -> Any:
+            Counted.asked += 1
+            return super().stat(follow_symlinks=follow_symlinks)
+
+    kept.book.path = Counted(kept.path)
+    keys = kept.book.now()
+    kept.path.unlink()
+    assert not keys.is_open and keys.find(secret) is not None and keys.named("alice") is not None
+    assert Counted.asked == 1
+
+
 def test_a_change_by_another_process_counts_at_once(kept: Book) -> None:
     secret = kept.add("alice")
     assert kept.book.find(secret) is not None
@@ -139,17 +156,17 @@ def test_a_session_ends_with_its_time_and_with_its_key(kept: Book) -> None:
     key = kept.book.named("alice")
     assert key is not None
     token, other = sessions.open(key), sessions.open(key)
-    assert sessions.find(token, kept.book) == key and sessions.find("x", kept.book) is None
+    assert sessions.find(token, kept.book.now()) == key and sessions.find("x", kept.book.now()) is None
     sessions.close(other)
-    assert sessions.find(other, kept.book) is None
+    assert sessions.find(other, kept.book.now()) is None
     kept.revoke("alice")
     kept.add("alice")
-    assert sessions.find(token, kept.book) is None, "another key of the same name is another key"
+    assert sessions.find(token, kept.book.now()) is None, "another key of the same name is another key"
     fresh = kept.book.named("alice")
     assert fresh is not None
     token = sessions.open(fresh)
     now_s[0] = SESSION_S
-    assert sessions.find(token, kept.book) is None
+    assert sessions.find(token, kept.book.now()) is None
 
 
 def test_a_key_file_of_a_client_is_its_users_alone(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -333,6 +334,45 @@ def test_a_stream_takes_the_key_in_the_header_or_as_its_first_message(guarded: G
             with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
                 socket.recv(timeout=5.0)
             assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+
+
+def test_a_stream_ends_with_the_key_that_began_it(
+    http: httpx2.Client, guarded: Guarded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    book, commit = guarded.server.service.keys, guarded.server.service.commit
+    monkeypatch.setattr("service.http.feed.ALIVE_S", 0.05)
+    secret = book.add("guest", Role.OBSERVER, valid_s=None, commit=commit)
+    url, mine = f"{guarded.server.url.replace('http', 'ws')}/v1/stream", {"Authorization": f"Bearer {secret}"}
+    with (
+        connect(url, additional_headers=mine) as by_header,
+        connect(url) as by_message,
+        http.stream("GET", "/v1/feed/events", headers=mine) as feed,
+    ):
+        by_message.send(f'{{"key": "{secret}"}}')
+        lines = feed.iter_lines()
+        assert next(lines).startswith("id: ")
+        for socket in (by_header, by_message):
+            assert "position_rad" in str(socket.recv(timeout=5.0))
+        book.revoke("guest", commit=commit)
+        for socket in (by_header, by_message):
+            with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
+                while True:
+                    socket.recv(timeout=5.0)
+            assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+        assert not [line for line in lines if line.startswith("id: ")], "and this stream ends"
+
+
+def test_the_events_of_a_task_end_with_the_key_that_follows_it(http: httpx2.Client, guarded: Guarded) -> None:
+    book, commit = guarded.server.service.keys, guarded.server.service.commit
+    secret = book.add("guest", Role.OBSERVER, valid_s=None, commit=commit)
+    ends = threading.Event()
+    task = guarded.server.service.tasks.start("wait", {}, lambda _task: ends.wait(60.0), moves=False)
+    with http.stream("GET", f"/v1/tasks/{task.id}/events", headers={"Authorization": f"Bearer {secret}"}) as events:
+        lines = events.iter_lines()
+        assert any("running" in line for line in lines)
+        book.revoke("guest", commit=commit)
+        ends.set()
+        assert not [line for line in lines if "succeeded" in line]
 
 
 def test_without_keys_everybody_here_may_and_the_page_says_so(client: httpx2.Client) -> None:

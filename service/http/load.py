@@ -1,7 +1,7 @@
 """Bounds what clients may use of the HTTP port, so that silent or greedy ones shut nobody out.
 
-A head must come within 5 s, a body at a least speed. When there are too many connections, the one that has been silent for
-the longest time is closed. Stops and health are answered whatever the load.
+A head must come within 5 s, a body at a least speed. When there are too many connections, the one of the greediest client
+that has been silent for the longest time is closed. Stops and health are answered whatever the load.
 """
 
 from __future__ import annotations
@@ -85,12 +85,16 @@ class Load:
                 del self._running[client]
 
     def opened(self, connection: LimitedProtocol) -> None:
-        """Count a connection; of too many, close the one that has waited for its head for the longest time."""
+        """Count a connection; of too many, close one that waits for its head.
+
+        It is the one that has waited for the longest time, among those of the client that has the most connections.
+        """
         self._open.add(connection)
         self.waits(connection)
         if len(self._open) > MAX_CONNECTIONS:
+            greedy = Counter(one.host for one in self._open).most_common(1)[0][0]
             oldest = next(iter(self._waiting))  # the new one at least
-            oldest.give_up()
+            next((one for one in self._waiting if one.host == greedy), oldest).give_up()
 
     def closed(self, connection: LimitedProtocol) -> None:
         """Count a connection no more."""
@@ -114,6 +118,7 @@ class LimitedProtocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
         """Begin to wait for the first head."""
         super().connection_made(transport)
+        self.host = self.client[0] if self.client else ""  # behind a proxy that of the proxy
         self._head_timer: asyncio.TimerHandle | None = None
         self._await_head()
         self.load.opened(self)

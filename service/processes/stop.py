@@ -53,31 +53,38 @@ class StopServer:
         self._latch = latch
         self._origins = origins
         self._hosts = {*LOCAL_NAMES, *(urlsplit(origin).hostname or "" for origin in origins)}
-        self._silent: dict[asyncio.StreamWriter, None] = {}  # those that have not sent a request line; the oldest first
+        self._open: dict[asyncio.StreamWriter, bool] = {}  # whether each connection has stopped; the oldest first
 
     async def start(self, listener: socket.socket) -> asyncio.Server:
         """Start to serve on a bound socket."""
         return await asyncio.start_server(self._serve, sock=listener, limit=MAX_HEAD_BYTES, backlog=512)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._silent[writer] = None
-        if len(self._silent) > MAX_CONNECTIONS:
-            next(iter(self._silent)).transport.abort()  # it would keep a later stop from being accepted
+        self._open[writer] = False
+        if len(self._open) > MAX_CONNECTIONS:
+            self._make_room(writer)
         try:
             line = await asyncio.wait_for(reader.readuntil(b"\n"), HEAD_TIMEOUT_S)
-            self._silent.pop(writer, None)
             peer = writer.get_extra_info("peername")
             state = self.begin(line, str(peer[0]) if isinstance(peer, tuple) else "local")
+            self._open[writer] = state is not None
             answer = self.answer(line + await _rest(reader), state, is_recorded=await self._is_recorded(state))
             writer.write(answer)
             await asyncio.wait_for(writer.drain(), HEAD_TIMEOUT_S)
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # a slow or broken client gets no answer and does not delay others
         finally:
-            self._silent.pop(writer, None)
+            self._open.pop(writer, None)
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
+
+    def _make_room(self, newest: asyncio.StreamWriter) -> None:
+        """Close the oldest connection that has not stopped, or else the oldest: it would keep a later stop out."""
+        waiting = (one for one, has_stopped in self._open.items() if not has_stopped and one is not newest)
+        oldest = next(waiting, next(iter(self._open)))
+        del self._open[oldest]  # at once, because many may come before its own task ends
+        oldest.transport.abort()
 
     def begin(self, line: bytes, peer: str) -> LatchState | None:
         """Latch the stop if the request line asks for it; nothing that follows can prevent it."""

@@ -132,6 +132,30 @@ def test_requests_in_work_are_counted_by_client_and_overall(monkeypatch: pytest.
     assert load.refusal("/v1/tasks", "a") is None
 
 
+def test_of_too_many_connections_those_of_the_greediest_client_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.http.load.MAX_CONNECTIONS", 4)
+    load, closed = Load(), list[str]()
+
+    class Connection:
+        def __init__(self, name: str) -> None:
+            self.name, self.host = name, name[0]
+
+        def give_up(self) -> None:
+            load.closed(self)  # type: ignore[arg-type]
+            closed.append(self.name)
+
+    for name in ("b1", "a1", "a2", "a3", "a4", "b2"):
+        load.opened(Connection(name))  # type: ignore[arg-type]
+    assert closed == ["a1", "a2"]
+    one, other = Load(), Connection("c1")
+    one.opened(other)  # type: ignore[arg-type]
+    one.works(other)  # type: ignore[arg-type]
+    load = one
+    for name in ("c2", "c3", "b1", "b2"):
+        load.opened(Connection(name))  # type: ignore[arg-type]
+    assert closed == ["a1", "a2", "c2"], "one that is in work is left alone"
+
+
 def test_what_computes_waits_for_its_modules_and_nothing_else_does(served: Panelwright, client: httpx2.Client) -> None:
     served.is_loaded.clear()
     with ThreadPoolExecutor(1) as pool:

@@ -344,6 +344,45 @@ def test_the_answer_to_a_stop_says_whether_it_is_recorded(tmp_path: Path) -> Non
     assert b'"is_recorded": true' in asyncio.run(_talk(latch, request, is_complete=True))
 
 
+@pytest.mark.parametrize("head", [b"", b"GET /v1/stop HTTP/1.1\r\nHost: 127", b"POST /v1/stop HTTP/1.1\r\nHost: 127"])
+def test_of_connections_that_come_at_once_and_never_end_no_more_are_kept_than_there_are_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, head: bytes
+) -> None:
+    monkeypatch.setattr("service.processes.stop.MAX_CONNECTIONS", 20)
+    monkeypatch.setattr("service.processes.stop.HEAD_TIMEOUT_S", 600.0)
+    latch = Latch.create(tmp_path / "latch")
+
+    async def scene() -> bytes:
+        listener = socket.create_server(("127.0.0.1", 0), backlog=512)
+        address = listener.getsockname()
+        crowd = [socket.create_connection(address) for _ in range(100)]  # all are accepted in one turn of the loop
+        for one in crowd:
+            one.sendall(head)
+            one.setblocking(False)
+        server = await StopServer(latch).start(listener)
+        loop = asyncio.get_running_loop()
+        ends = [asyncio.ensure_future(_ended(loop, one)) for one in crowd]
+        while sum(end.done() for end in ends) < 80:
+            await asyncio.wait([end for end in ends if not end.done()], return_when=asyncio.FIRST_COMPLETED)
+        reader, writer = await asyncio.open_connection(*address)
+        writer.write(b"POST /v1/stop HTTP/1.1\r\n\r\n")
+        answer = await reader.read()
+        writer.close()
+        for end, one in zip(ends, crowd, strict=True):
+            end.cancel()
+            one.close()
+        server.close()
+        return answer
+
+    assert asyncio.run(asyncio.wait_for(scene(), 120.0)).startswith(b"HTTP/1.1 200")
+
+
+async def _ended(loop: asyncio.AbstractEventLoop, link: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while await loop.sock_recv(link, 4000):
+            pass
+
+
 def test_a_thousand_silent_connections_do_not_keep_a_stop_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest silent connection is closed for each new one, so that files do not run out."""
     monkeypatch.setattr("service.processes.stop.MAX_CONNECTIONS", 20)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
+import select
 import socket
 import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import DeviceUnavailable
-from hal.process_state import ProcessState, process_state
+from hal.process_state import ProcessState, ThreadTimes, process_state, threads_of
 from hal.spare_process import start_module
 from simbackend.wire import DOUBLE, IMAGE_BYTES, REQUEST, SNAPSHOT, Op, WorldConfig, read_exactly
 
@@ -26,7 +27,41 @@ START_S = 180.0  # the first start on a machine compiles the rasteriser; later o
 CLOSE_S = 2.0
 SUSPENDED_S = 1.0  # a world that a debugger holds for longer is given up
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # the other core is for the cell
+PATIENCE_S = 0.5  # nobody asks what a world does that owes an answer for a shorter time
+STILL_S = 2.0
+COMPUTING_S = 4.0  # of one answer
 ANSWER_S = 20.0  # the longest answer, a large picture on a busy machine, takes about a second
+
+
+class Debt:
+    """Tells a world that owes an answer and hangs from one that works on it, and from one for which the machine has no time.
+
+    Args:
+        threads: returns the threads of a process by id.
+    """
+
+    def __init__(self, threads: Callable[[int], dict[int, ThreadTimes]] = threads_of) -> None:
+        self._threads = threads
+        self._asked_at_s: float | None = None
+        self._still_since_s = self._computed_s = 0.0
+        self._turns = 0
+
+    def look(self, pid: int, asked_at_s: float | None, now_s: float) -> str | None:
+        """Return why the answer will not come, as in "has done nothing"; None if it may. Call it many times a second."""
+        if asked_at_s is None or now_s - asked_at_s < PATIENCE_S:
+            self._asked_at_s = None
+            return None
+        threads = self._threads(pid).values()
+        turns, computed_s = sum(one.turns for one in threads), sum(one.computed_s for one in threads)
+        if self._asked_at_s != asked_at_s:
+            self._asked_at_s, self._still_since_s, self._computed_s = asked_at_s, now_s, computed_s
+        if not threads or turns != self._turns or any(one.state in "RD" for one in threads):
+            self._turns, self._still_since_s = turns, now_s
+        if now_s - self._still_since_s > STILL_S:
+            return f"hangs: it owes an answer and has done nothing for {STILL_S:.0f} s"
+        if computed_s - self._computed_s > COMPUTING_S:
+            return f"hangs: it has computed for {COMPUTING_S:.0f} s and not answered"
+        return None
 
 
 class WorldLink:
@@ -37,6 +72,7 @@ class WorldLink:
         self._is_closed = False
         self._suspended_since_s: float | None = None
         self._asked_at_s: float | None = None  # while an answer is awaited
+        self._debt = Debt()
         ours, theirs = socket.socketpair()
         with tempfile.TemporaryFile(prefix="panelwright-images-") as file:
             file.truncate(IMAGE_BYTES)
@@ -89,7 +125,8 @@ class WorldLink:
     def why_ended(self) -> str | None:
         """Return how the process was lost, as in "the simulated world has ended"; None while it lives or is closed.
 
-        It is lost when it has ended, when it has been suspended for a second, and when it does not answer for 20 s.
+        It is lost when it has ended, when it has been suspended for a second, when it owes an answer and does nothing for
+        two seconds or has computed for four, and when it does not answer for 20 s on a machine that is too busy for it.
         """
         now_s, asked_at_s = time.monotonic(), self._asked_at_s
         if self._is_closed:
@@ -101,11 +138,16 @@ class WorldLink:
             return f"the simulated world did not answer for {ANSWER_S:.0f} s"
         if process_state(self.process.pid) is not ProcessState.SUSPENDED:
             self._suspended_since_s = None
-            return None
+            why = self._debt.look(self.process.pid, asked_at_s, now_s)
+            return None if why is None or self._has_answered() else f"the simulated world {why}"
         if self._suspended_since_s is None:
             self._suspended_since_s = now_s
         held_s = now_s - self._suspended_since_s
         return f"the simulated world {ProcessState.SUSPENDED}" if held_s > SUSPENDED_S else None
+
+    def _has_answered(self) -> bool:
+        """Whether an answer has come that nobody has read yet."""
+        return bool(select.select([self._stream], [], [], 0.0)[0])
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:

@@ -24,13 +24,14 @@ from hal.motion import (
 )
 from hal.panel import Scale, load_panel
 from manipulation.arm.kinematics import Kinematics
+from manipulation.control.setpoint import is_retreat
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.context import SkillContext
 from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 from manipulation.skills.probe import proximity_probe
-from manipulation.skills.retreat import PULLS, park, retreat
+from manipulation.skills.retreat import PULLS, park, retreat, step_back
 from manipulation.skills.slider import between_witnesses
 from manipulation.skills.toggle import toggle
 from tests.manipulation.arms import T3
@@ -172,6 +173,23 @@ def test_a_hand_that_is_held_is_pulled_again() -> None:
         with pytest.raises(MotionError, match="did not come free") if pulls == PULLS else nullcontext():
             retreat(context)
         assert mover.asked.count("retreat") == pulls
+
+
+@pytest.mark.parametrize("pressed_n", [0.0, 30.0])
+def test_no_motion_of_a_retreat_or_of_parking_needs_more_than_the_arm(pressed_n: float) -> None:
+    held = replace(COMPLETED, outcome=MotionOutcome.GUARD, tripped="held")
+    context, mover = before_the_bench({"retreat": held})
+    state = replace(mover.state(), wrench=np.array([pressed_n, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    mover.state = lambda: state  # type: ignore[method-assign]
+    with pytest.raises(MotionError):
+        retreat(context)
+    assert {"retreat", "relax", "let go"} | ({"give way"} if pressed_n else set()) == set(mover.asked)
+    way = np.linspace(HOME, HOME + 0.1, 20)
+    step_back(context, replace(held, position_rad=way[-1], log=replace(held.log, positions_rad=way)))
+    free, parking = before_the_bench({})
+    park(free)
+    assert mover.asked[-1] == "step back" and parking.asked == ["to park"]
+    assert all(is_retreat(motion) for motion in (*mover.motions, *parking.motions))
 
 
 def test_what_holds_the_arm_up_on_its_way_to_park_is_an_error_of_the_motion_and_no_defect() -> None:

@@ -382,27 +382,3 @@ async def _ended(loop: asyncio.AbstractEventLoop, link: socket.socket) -> None:
     with contextlib.suppress(OSError):
         while await loop.sock_recv(link, 4000):
             pass
-
-
-def test_a_thousand_silent_connections_do_not_keep_a_stop_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oldest silent connection is closed for each new one, so that files do not run out."""
-    monkeypatch.setattr("service.processes.stop.MAX_CONNECTIONS", 20)
-    latch = Latch.create(tmp_path / "latch")
-
-    async def scene() -> bytes:
-        listener = socket.socket()
-        listener.bind(("127.0.0.1", 0))
-        server = await StopServer(latch).start(listener)
-        port = listener.getsockname()[1]
-        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(40)]
-        closed = await asyncio.wait_for(silent[0][0].read(), 30.0)
-        assert closed == b"", "the first was closed before its time"
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        writer.write(b"POST /v1/stop HTTP/1.1\r\n\r\n")
-        answer = await reader.read()
-        for _, each in [*silent, (reader, writer)]:
-            each.close()
-        server.close()
-        return answer
-
-    assert asyncio.run(scene()).startswith(b"HTTP/1.1 200")

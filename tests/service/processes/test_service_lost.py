@@ -17,7 +17,7 @@ from service.processes.latch import Latch, StopLevel
 from tests.service.conftest import WriteCell
 from tests.service.waiting import eventually
 
-BEGUN_RAD = 0.25  # of the first joint, with which the tip has gone further than it goes back
+BEGUN_RAD = 0.35  # of the first joint, with which the tip has gone further than it goes back
 LEAST_BACK_RAD = 0.1
 SERVICE = """
 import sys

@@ -30,7 +30,7 @@ from tests.service.conftest import WriteCell
 from tests.service.history.test_store import reading
 
 ROLES = (None, *Role)
-ALARM_DEEDS = ("acknowledge", "shelve", "unshelve", "out-of-service", "in-service")
+ALARM_DEEDS = ("acknowledge", "comment", "shelve", "unshelve", "out-of-service", "in-service")
 PLACE = {
     "{alarm}": "none.high",
     "{object}": "none",

@@ -118,6 +118,7 @@ CHANGES: dict[str, tuple[str, Callable[[httpx2.Client], Ask]]] = {
         "mission-stored", sent("PUT", "/v1/mission-files/look", json={"text": MISSION, "replaces": None}),
     ),
     "POST /v1/alarms/{alarm}/acknowledge": ("alarm", alarm("acknowledge")),
+    "POST /v1/alarms/{alarm}/comment": ("alarm", alarm("comment")),
     "POST /v1/alarms/{alarm}/shelve": ("alarm", alarm("shelve")),
     "POST /v1/alarms/{alarm}/unshelve": ("alarm", alarm("unshelve", "shelve")),
     "POST /v1/alarms/{alarm}/out-of-service": ("alarm", alarm("out-of-service")),

@@ -46,12 +46,12 @@ def test_a_deed_says_what_it_shall_reach(body: dict[str, Any], target: str | flo
 
 NONSENSE = [
     ({"object": "setpiont", "value": 4.0}, "no object called", "'setpoint'"),
-    ({"object": "setpoint", "value": 400.0}, "value from 0 to 100 %", "'value'"),
-    ({"object": "setpoint"}, "value from 0 to 100 %", "'value'"),
-    ({"object": "bypass", "angle_rad": 50.0}, "angle_rad from", "'angle_rad'"),
+    ({"object": "setpoint", "value": 400.0}, "value from 0 to 100 %", "value"),
+    ({"object": "setpoint"}, "value from 0 to 100 %", "value"),
+    ({"object": "bypass", "angle_rad": 50.0}, "angle_rad from", "angle_rad"),
     ({"object": "main_valve", "state": "ajar"}, "no state 'ajar'", "open"),
     ({"object": "main_valve"}, "needs a state", "open"),
-    ({"object": "emergency", "value": 3.0}, "takes state, not value", "'state'"),
+    ({"object": "emergency", "value": 3.0}, "takes state, not value", "state"),
     ({"object": "start", "state": "pressed"}, "no state 'pressed'", "on, off"),
     ({"object": "hold", "state": "on"}, "no state 'on'", "pressed, released"),
     ({"object": "pressure", "value": 3.0}, "cannot be operated", "lever"),

@@ -6,33 +6,20 @@ user, so even `kill -9` leaves nothing behind. A channel carries one call at a t
 
 from __future__ import annotations
 
-import copyreg
 import io
 import mmap
 import os
 import pickle
-from collections.abc import Callable
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scipy.spatial.transform import RigidTransform
-
-from hal.arrays import Array
 from hal.clock import Clock, Deadline
-from hal.geometry import orthonormal
 
 INLINE_BYTES = 16_384  # below this a pipe is as fast as shared memory
 
 
-def _transform(pose: RigidTransform) -> tuple[Callable[[Array], RigidTransform], tuple[Array]]:
-    return orthonormal, (pose.as_matrix(),)
-
-
 class _Pickler(pickle.Pickler):
-    # SciPy's own way normalises every pose of a path anew at the other end, which takes six times as long.
-    dispatch_table = {**copyreg.dispatch_table, RigidTransform: _transform}
-
     def persistent_id(self, obj: Any) -> Any:
         # The two sides have different clocks, so the remaining time is sent.
         return obj.remaining_s() if isinstance(obj, Deadline) else None

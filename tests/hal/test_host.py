@@ -12,11 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
 
 from hal.clock import Deadline, PacedClock, WallClock
 from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
-from hal.geometry import transform_rpy
 from hal.host import HostServer, Proxy
 from hal.host_process import HostProcess
 from hal.isolated import isolated_device
@@ -31,9 +29,6 @@ class Calculator:
 
     def double(self, image: np.ndarray) -> Stamped[np.ndarray]:
         return Stamped(value=image * 2, host_time_s=1.5, sequence=3)
-
-    def same(self, poses: list[RigidTransform]) -> list[RigidTransform]:
-        return poses
 
     def fail(self) -> None:
         raise DeviceFault("calculator overheats", hint="let it cool", device="calculator")
@@ -76,12 +71,6 @@ def test_arrays_of_any_size_come_back_whole(host: HostProcess, size: int) -> Non
     assert (answer.host_time_s, answer.sequence) == (1.5, 3)
     np.testing.assert_array_equal(answer.value, image * 2)
     answer.value[0] = 7  # a received array belongs to the receiver
-
-
-def test_poses_come_back_to_the_last_bit(host: HostProcess) -> None:
-    poses = [transform_rpy((0.1 * k, 0.2, 0.3), (0.7 * k, -0.4 * k, 1.3 * k)) for k in range(20)]
-    answer = host.proxy("calculator").same(poses)
-    np.testing.assert_array_equal([one.as_matrix() for one in answer], [one.as_matrix() for one in poses])
 
 
 def test_typed_errors_come_back_as_themselves(host: HostProcess) -> None:

@@ -23,22 +23,9 @@ from playwright.sync_api import Browser, sync_playwright
 
 from benchmarks.console_jobs import JOBS
 from benchmarks.console_served import FINAL, Served, new_page, served, until
-from tests.service.browser import CHROMIUM, FLAGS
+from tests.service.browser import CHROMIUM, CONSOLE_PAGES, FLAGS
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (
-    "/",
-    "/missions",
-    "/rounds",
-    "/alarms",
-    "/review",
-    "/history",
-    "/devices",
-    "/setup",
-    "/cell",
-    "/mission-editor",
-    "/teach",
-)
 SIZES, SCHEMES = ((1440, 900), (390, 844)), ("light", "dark")
 BROWSERS = 10
 LONGEST_S = 5.0
@@ -129,7 +116,7 @@ def latency(service: Served, browser: Browser, given: argparse.Namespace) -> Ite
 def crowd(service: Served, browser: Browser, given: argparse.Namespace) -> Iterator[Line]:
     """Measure event loop and stops beside a mission that ten browsers follow on different pages."""
     pages = [new_page(browser) for _ in range(BROWSERS)]
-    for page, path in zip(pages, [*PAGES, "/"], strict=False):
+    for page, path in zip(pages, [*CONSOLE_PAGES, "/"], strict=False):
         page.goto(service.console_url + path)
     task = service.client.post("/v1/missions", {"file": "inspect"})
     for page in pages:
@@ -171,7 +158,7 @@ def axe(service: Served, browser: Browser, _given: argparse.Namespace) -> Iterat
     for width, height in SIZES:
         for scheme in SCHEMES:
             page = new_page(browser, width=width, height=height, scheme=scheme, bypass_csp=True)
-            for path in PAGES:
+            for path in CONSOLE_PAGES:
                 page.goto(service.console_url + path)
                 until(page, "document.querySelector('.top .quiet').textContent.includes('panel')")
                 page.wait_for_timeout(1000)

@@ -20,6 +20,19 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+CONSOLE_PAGES = (
+    "/",
+    "/missions",
+    "/rounds",
+    "/alarms",
+    "/review",
+    "/history",
+    "/devices",
+    "/setup",
+    "/cell",
+    "/mission-editor",
+    "/teach",
+)
 PATIENCE_MS = 150_000  # the first click may compile kernels, and the machine may be busy
 NEEDS_CHROMIUM = [
     pytest.mark.slow,

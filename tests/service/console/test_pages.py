@@ -12,26 +12,13 @@ import numpy as np
 import pytest
 
 from service.access.keys import Role
-from tests.service.browser import NEEDS_CHROMIUM
+from tests.service.browser import CONSOLE_PAGES, NEEDS_CHROMIUM
 from tests.service.conftest import WriteCell
 from tests.service.console.served import Cell, leave_mission, until
 from tests.service.console.test_five_tasks import DIALOG
 from tests.service.waiting import eventually
 
 pytestmark = NEEDS_CHROMIUM
-PAGES = (
-    "/",
-    "/missions",
-    "/rounds",
-    "/alarms",
-    "/review",
-    "/history",
-    "/devices",
-    "/setup",
-    "/cell",
-    "/mission-editor",
-    "/teach",
-)
 
 
 def test_the_panel_shows_and_a_new_reading_appears_by_itself(page: Any, cell: Cell) -> None:
@@ -229,7 +216,7 @@ def test_every_page_fits_and_has_no_barrier(browser: Any, cell: Cell, width_px: 
     context = browser.new_context(viewport={"width": width_px, "height": 844}, color_scheme=scheme, bypass_csp=True)
     tab = context.new_page()
     found: list[str] = []
-    for path in PAGES:
+    for path in CONSOLE_PAGES:
         tab.goto(cell.url + path)
         until(tab, "document.querySelector('.top .quiet').textContent.includes('panel fake')")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width_px, path

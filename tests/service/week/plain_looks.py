@@ -59,10 +59,10 @@ class PlainHands:
         return ""
 
     def feel(self, step: FeelStep) -> None:
-        raise NotImplementedError
+        raise AssertionError(f"no mission of the week touches the panel, but {step.name} does")
 
     def wait(self, duration_s: float) -> None:
-        raise NotImplementedError
+        raise AssertionError(f"no mission of the week waits, but one does for {duration_s} s")
 
     def now_s(self) -> float:
         return self._context.connection.clock.now_s()

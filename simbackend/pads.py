@@ -68,22 +68,32 @@ class Pads:
 
 
 class Roots:
-    """The yielding roots of the fingers; in ticks that are too long for their springs they are rigid.
+    """The yielding roots of the fingers; in ticks that are too long for their springs the fingers are rigid.
+
+    The springs are plain forces on the joints, also where the gripper drives a finger: along x the spring's place of
+    rest moves with the gripper. A motor of the engine at that joint would be simpler, but the engine then reports a
+    force at the wrist that is wrong by up to a third along x.
 
     Args:
         engine: a connected PyBullet client.
         arm: the engine's number of the arm.
-        joints: the engine's numbers of the joints at the roots, along one axis each.
+        fingers: for each finger the engine's numbers of its joints along x, y and z.
     """
 
-    def __init__(self, engine: Any, arm: int, joints: Sequence[int], *, dt_s: float) -> None:
+    def __init__(self, engine: Any, arm: int, fingers: Sequence[Sequence[int]], *, dt_s: float) -> None:
         self.yields = dt_s <= LONGEST_TICK_S
-        for joint in joints:
-            holding_n = 0.0 if self.yields else RIGID_N
-            engine.setJointMotorControl2(arm, joint, engine.VELOCITY_CONTROL, force=holding_n)
+        for finger in fingers:
+            for joint in finger:
+                holding_n = 0.0 if self.yields else RIGID_N
+                engine.setJointMotorControl2(arm, joint, engine.VELOCITY_CONTROL, force=holding_n)
 
     def force_n(self, offset_m: float, speed_m_per_s: float) -> float:
-        """Return the force along one axis that brings a finger back to its place."""
+        """Return the force along one axis that brings a finger back to its place.
+
+        Args:
+            offset_m: distance from where the gripper holds its root.
+            speed_m_per_s: the same of its speed.
+        """
         if not self.yields:
             return 0.0
         return -ROOT_STIFFNESS_N_PER_M * offset_m - ROOT_DAMPING_N_S_PER_M * speed_m_per_s

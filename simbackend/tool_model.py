@@ -18,9 +18,10 @@ FINGER_THICKNESS_M = 0.007
 FINGER_WIDTH_M = 0.012
 FINGER_LENGTH_M = 0.075
 FINGER_MASS_KG = 0.04
-ROOT_MASS_KG = 0.002  # of each of the three parts between gripper and finger
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # along which a finger gives way
+ROOT_MASS_KG = 0.002  # of each of the two parts between gripper and finger
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # along which a finger moves
 GIVE_LIMITS_M = (-0.02, 0.02)
+OPENING_LIMITS_M = (GIVE_LIMITS_M[0], MAX_WIDTH_M / 2.0 + GIVE_LIMITS_M[1])  # of one finger, outwards
 SENSOR_MASS_KG = 0.01  # the part of the sensor below its measuring element
 DARK = (0.18, 0.18, 0.20)
 STEEL = (0.55, 0.57, 0.60)
@@ -47,13 +48,12 @@ def tool_urdf(*, flange_from_sensor: RigidTransform, flange_from_grip: RigidTran
     )
     lines += joint("gripper", "fixed", "sensor", "gripper", sensor_from_grip)
     for name, side in (("left", -1.0), ("right", 1.0)):
-        limits = (-0.002, MAX_WIDTH_M / 2.0 + 0.002)
-        lines += _slide(f"finger_{name}", "gripper", f"carriage_{name}", axis=(side, 0, 0), limits=limits)
-        lines += link(f"carriage_{name}", _lump(ROOT_MASS_KG))
-        parent = f"carriage_{name}"
+        parent = "gripper"
         for letter, axis in AXES.items():
             child = f"finger_{name}" if letter == "z" else f"root_{letter}_{name}"
-            lines += _slide(f"give_{letter}_{name}", parent, child, axis=axis, limits=GIVE_LIMITS_M)
+            limits, turned = (OPENING_LIMITS_M, side) if letter == "x" else (GIVE_LIMITS_M, 1.0)
+            along = (turned * axis[0], axis[1], axis[2])
+            lines += _slide(f"give_{letter}_{name}", parent, child, axis=along, limits=limits)
             lines += link(child, *([_lump(ROOT_MASS_KG)] if letter != "z" else _finger(side)))
             parent = child
     return lines
@@ -64,7 +64,7 @@ def _finger(side: float) -> list[list[str]]:
     middle = (side * FINGER_THICKNESS_M / 2.0, 0.0, -FINGER_LENGTH_M / 2.0)
     geometry = box((FINGER_THICKNESS_M, FINGER_WIDTH_M, FINGER_LENGTH_M))
     return [
-        inertial(FINGER_MASS_KG - 3.0 * ROOT_MASS_KG, middle, (2e-5, 2e-5, 5e-6)),
+        inertial(FINGER_MASS_KG - 2.0 * ROOT_MASS_KG, middle, (2e-5, 2e-5, 5e-6)),
         shape(at(*middle), geometry, STEEL),
     ]
 

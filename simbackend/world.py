@@ -94,10 +94,8 @@ class World:
         self.arm = engine.loadURDF(str(path), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE)
         index = {engine.getJointInfo(self.arm, i)[1].decode(): i for i in range(engine.getNumJoints(self.arm))}
         self.joints = [index[f"link{i + 1}"] for i in range(len(self.model.capabilities.links))]
-        self.fingers = [index["finger_left"], index["finger_right"]]
-        self.driven = [*self.joints, *self.fingers]
-        gives = [[index[f"give_{axis}_{side}"] for axis in AXES] for side in ("left", "right")]
-        self.moving = [*self.joints, self.fingers[0], *gives[0], self.fingers[1], *gives[1]]  # in the engine's order
+        fingers = [[index[f"give_{axis}_{side}"] for axis in AXES] for side in ("left", "right")]
+        self.moving = [*self.joints, *fingers[0], *fingers[1]]  # in the engine's order
         self.sensor, self.flange_link = index["sensor"], index["flange"]
         self.flange_from_grip = mounts["gripper"]
         self.gripper_link = index["gripper"]
@@ -105,19 +103,21 @@ class World:
             engine.changeDynamics(self.arm, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
             engine.setCollisionFilterGroupMask(self.arm, i, ARM_GROUP, PANEL_GROUP)
         self.pads = Pads(
-            engine, self.arm, [side[-1] for side in gives], friction=self.cell.file.simulation.pad_friction
+            engine, self.arm, [finger[-1] for finger in fingers], friction=self.cell.file.simulation.pad_friction
         )
         engine.enableJointForceTorqueSensor(self.arm, self.sensor, 1)
         park = np.asarray(self.cell.file.workspace.park_rad, float)
         self.drive = ArmDrive(self.model.capabilities, park, self.dt_s, lookahead_s=self.config.lookahead_s)
         is_rigid = self.cell.file.hand.fingers == 1  # the two fingers stay together as one
         self.gripper = GripperDrive(self.dt_s, width_m=0.0, _target_m=0.0) if is_rigid else GripperDrive(self.dt_s)
-        places = [*park, self.gripper.width_m / 2, self.gripper.width_m / 2]
-        for joint, place in zip(self.driven, places, strict=True):
+        slides = [finger[0] for finger in fingers]
+        for joint, place in zip([*self.joints, *slides], [*park, *[self.gripper.width_m / 2] * 2], strict=True):
             engine.resetJointState(self.arm, joint, place)
-        self.roots = Roots(engine, self.arm, [*gives[0], *gives[1]], dt_s=self.dt_s)
-        self._forces = [*self.model.torque_nm, FINGER_FORCE_N, FINGER_FORCE_N]
-        self._gains = [ARM_GAIN] * len(self.joints) + [FINGER_GAIN] * 2
+        self.roots = Roots(engine, self.arm, fingers, dt_s=self.dt_s)
+        held = [] if self.roots.yields else slides
+        self.driven = [*self.joints, *held]
+        self._forces = [*self.model.torque_nm, *[FINGER_FORCE_N] * len(held)]
+        self._gains = [ARM_GAIN] * len(self.joints) + [FINGER_GAIN] * len(held)
         self._damps = [1.0] * len(self.driven)
         self._zeros = [0.0] * len(self.moving)
 
@@ -179,19 +179,23 @@ class World:
         engine = self.engine
         self.drive.tick()
         self.gripper.tick(self.pads.force_n)
-        half, pad_speed = self.gripper.width_m / 2, self.gripper.speed / 2
+        half_m, pad_speed_m_per_s = self.gripper.width_m / 2, self.gripper.speed / 2
         # Gravity torque is added to the position motor: the servo sags by 2 to 12 mrad without it and by 1e-16 with it.
         efforts = list(engine.calculateInverseDynamics(self.arm, self.q, self._zeros, self._zeros))
-        first = len(self.joints)
-        for k in (*range(first + 1, first + 4), *range(first + 5, first + 8)):
-            efforts[k] = self.roots.force_n(self.q[k], self.v[k])
+        joints, held = len(self.joints), len(self.driven) - len(self.joints)
+        places = (half_m, 0.0, 0.0) * 2
+        speeds = (pad_speed_m_per_s, 0.0, 0.0) * 2
+        efforts[joints:] = [
+            self.roots.force_n(q - place, v - speed)
+            for q, place, v, speed in zip(self.q[joints:], places, self.v[joints:], speeds, strict=True)
+        ]
         engine.setJointMotorControlArray(self.arm, self.moving, engine.TORQUE_CONTROL, forces=efforts)
         engine.setJointMotorControlArray(
             self.arm,
             self.driven,
             engine.POSITION_CONTROL,
-            targetPositions=[*self.drive.setpoint.tolist(), half, half],
-            targetVelocities=[*self.drive.speed.tolist(), pad_speed, pad_speed],
+            targetPositions=[*self.drive.setpoint.tolist(), *[half_m] * held],
+            targetVelocities=[*self.drive.speed.tolist(), *[pad_speed_m_per_s] * held],
             forces=self._forces,
             positionGains=self._gains,
             velocityGains=self._damps,
@@ -240,7 +244,7 @@ class World:
                 *spare,
                 *reaction,
                 *self.pads.force_n,
-                *(self.q[joints] + self.q[joints + 4], self.gripper.is_moving, self.gripper.is_holding, 0.0),
+                *(self.gripper.width_m, self.gripper.is_moving, self.gripper.is_holding, 0.0),
                 *self.panel.lights_on,
                 *[0.0] * (LIGHTS - len(self.panel.lights_on)),
                 *self._proximity,

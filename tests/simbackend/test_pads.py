@@ -5,11 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from hal.config import load_cell
 from simbackend.pads import PAD_STIFFNESS_N_PER_M, ROOT_STIFFNESS_N_PER_M, Pads, Roots
 from simbackend.urdf import at, box, inertial, joint, link, shape, sphere
-from simbackend.world import _quiet_pybullet
+from simbackend.wire import WorldConfig
+from simbackend.world import World, _quiet_pybullet
+from tests.simbackend.rig import BENCH
 
 GREY = (0.5, 0.5, 0.5)
 DT_S = 0.002
@@ -44,7 +48,7 @@ def pressed_n(engine: Any, folder: Path, geometry: str, half_m: float, way_m: fl
     (folder / "body.urdf").write_text("\n".join(body), encoding="ascii")
     hand = engine.loadURDF(str(folder / "hand.urdf"), useFixedBase=True, flags=engine.URDF_USE_INERTIA_FROM_FILE)
     engine.loadURDF(str(folder / "body.urdf"), useFixedBase=True)
-    pads, roots = Pads(engine, hand, [1], friction=0.5), Roots(engine, hand, [1], dt_s=DT_S)
+    pads, roots = Pads(engine, hand, [1], friction=0.5), Roots(engine, hand, [[1]], dt_s=DT_S)
     begins_m, force_n = 0.080 - half_m - 0.075, 0.0
     for tick in range(1500):
         goal_m = begins_m + way_m * min(1.0, tick / 800)
@@ -99,7 +103,31 @@ def test_the_force_on_a_pad_is_that_of_all_its_contact_points() -> None:
 
 def test_roots_are_rigid_in_ticks_that_are_too_long_for_their_springs() -> None:
     engine = Engine()
-    assert Roots(engine, 0, [1, 2], dt_s=0.002).force_n(0.001, 0.0) < 0.0
-    assert Roots(engine, 0, [1, 2], dt_s=0.01).force_n(0.001, 0.0) == 0.0
+    assert Roots(engine, 0, [[1, 2]], dt_s=0.002).force_n(0.001, 0.0) < 0.0
+    assert Roots(engine, 0, [[1, 2]], dt_s=0.01).force_n(0.001, 0.0) == 0.0
     assert engine.holding_n[:2] == [0.0, 0.0]
     assert min(engine.holding_n[2:]) > 100.0
+
+
+def test_the_wrist_shows_a_force_on_a_finger_in_full_along_each_axis() -> None:
+    world = World(WorldConfig(cell=load_cell(BENCH, seed=11), model="t3", proximity=(), proximity_range_m=0.3))
+    engine = world.engine
+    try:
+        finger = next(
+            i for i in range(engine.getNumJoints(world.arm)) if engine.getJointInfo(world.arm, i)[12] == b"finger_left"
+        )
+        for _ in range(100):
+            world._advance()
+        unloaded = np.array(world.reaction)
+        for force_n in 50.0 * np.eye(3):
+            for _ in range(300):
+                turn = np.array(engine.getMatrixFromQuaternion(engine.getLinkState(world.arm, world.sensor)[5]))
+                at_m = engine.getLinkState(world.arm, finger)[0]
+                pushed = (turn.reshape(3, 3) @ force_n).tolist()
+                engine.applyExternalForce(world.arm, finger, pushed, at_m, engine.WORLD_FRAME)
+                world._advance()
+            assert (unloaded - world.reaction)[:3] == pytest.approx(force_n, abs=0.2)
+            for _ in range(300):
+                world._advance()
+    finally:
+        world.close()

@@ -156,7 +156,7 @@ def assert_everything_was_stored(folder: Path, report: dict[str, Any]) -> None:
     assert len(sizes) == len(stored) and all(16 < side < 480 for size in sizes for side in size)
 
 
-UNMET = {"object": "pressure", "above": 11.0, "unit": "bar"}  # beyond the scale
+UNMET = {"object": "pressure", "above": 9.9, "unit": "bar"}  # at the end of the scale, where no seed puts the needle
 GUARDED = {
     "steps": [
         {"kind": "inspect", "name": "read", "objects": ["pressure", "flow"]},

@@ -25,6 +25,7 @@ RESTING_RAD_PER_S = 1e-4
 BY_CONTACT = (Quantity.FORCE, Quantity.TORQUE, Quantity.FORCE_RISE)
 SLOWING_M_PER_S2 = 2.0  # a lower limit of the tip's speed takes effect at this rate, so that the arm can follow it
 BEHIND_M, BEHIND_TICKS = 0.002, 3  # a set-point that is so far behind the wanted one lets the motion's time stand still
+ON_ITS_WAY_RAD = 1e-6
 LOOK_BACK_TICKS = 3  # with one, a jitter of 10 % in the ticks triples the following error of a steady motion
 
 
@@ -81,9 +82,12 @@ class SetPointLimiter:
     def waiting_share(self, wanted_rad: Array, out_rad: Array) -> float:
         """Return the share of a tick for which the motion's time must stand still, so that the set-point stays on its way.
 
-        Below the speed for which a motion is planned, its set-points would run ahead and the arm would cut its corners.
+        Otherwise the set-points of the motion would run ahead and the arm would cut its corners. That happens below the
+        speed for which the motion is planned, and at that speed too: where a way just keeps the limit of the tip, the
+        smallest excess slows each joint by its own share, and the arm left a planned way by 0.3 rad. A set-point that stands
+        still is not waited for, because nothing would end its motion.
         """
-        if self._tip_limit >= self._full_m_per_s:
+        if self.is_at_rest or np.abs(wanted_rad - out_rad).max() < ON_ITS_WAY_RAD:
             return 0.0
         behind = self._workspace.tip_m(wanted_rad) - self._workspace.tip_m(out_rad)
         most_m = max(BEHIND_M, BEHIND_TICKS * self._full_m_per_s * self._dt_s)

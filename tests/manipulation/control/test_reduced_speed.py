@@ -60,6 +60,20 @@ def test_a_motion_may_have_a_speed_limit_of_its_own_and_cannot_raise_that_of_the
     assert speeds_m_per_s(rig).max() <= SLACK * kept_m_per_s
 
 
+@pytest.mark.parametrize("share", [0.97, 0.6])
+def test_a_motion_that_asks_for_more_than_the_speed_of_the_cell_keeps_its_way(rig: Rig, share: float) -> None:
+    """Each joint was slowed by its own share, and an arm that lagged cut the corner of its way."""
+    slow = joints(HOME + TURN, 1.0)
+    rig.controller.execute(slow)
+    duration_s = share * float(np.max(speeds_m_per_s(rig))) / 0.25
+    other = make_rig()
+    report = other.controller.execute(joints(HOME + TURN, duration_s))
+    other.controller.close()
+    assert report.outcome is MotionOutcome.COMPLETED
+    assert speeds_m_per_s(other).max() <= SLACK * 0.25
+    assert way_off_m(other, joints(HOME + TURN, 4.0)) < 0.001
+
+
 @pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.name)
 def test_people_who_come_slow_a_running_motion_down_and_it_goes_on_when_they_have_gone(
     rig: Rig, motion: DeclaredMotion

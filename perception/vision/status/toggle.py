@@ -24,6 +24,10 @@ FLANK, WIDE_FLANK = (
     (2.3, 2.6),
 )  # distances from the axis of the stripes that are compared with the bat, over 0.8 of its radius
 AT_FOOT = (0.15, 0.5)  # share of the length in which a bat as gray as the plate contrasts with the nut around its foot
+#: Places of the bat's axis beside the one of the registered panel, in bat radii. Where few edges of the panel are in view,
+#: its registered pose is wrong by as much, and there the other side of the nut looked like a bat.
+ASIDE = (0.0, -0.35, 0.35, -0.7, 0.7)
+ASIDE_COST = 0.2  # share of the contrast that a place a radius aside must have more
 AT_FOOT_NOISE = 3.0  # times the noise of a contrast; less is no evidence there
 
 
@@ -33,9 +37,10 @@ def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
     y = np.linspace(-1, 1, 12)[:, None] * reach
     seen = patch.seen(np.array([-1.0, 0.0, 1.0]) * spec.bat_radius_m + 0 * y, y + np.zeros(3))
     noise = contrast_noise(patch)
-    at_foot = _at_foot(patch, spec, noise)
+    aside_m = _aside_m(patch, spec)
+    at_foot = _at_foot(patch, spec, noise, aside_m)
     for flank in (FLANK, WIDE_FLANK):
-        contrast = np.array([_bat(patch, spec, angle, flank) for angle in LEANS])
+        contrast = np.array([_bat(patch, spec, angle, flank, aside_m) for angle in LEANS])
         status = choose(STATES, _of_one_colour(contrast), noise=noise, seen=seen, what="bat")
         if status.answered and status.state is not None:
             k = STATES.index(status.state)
@@ -44,6 +49,17 @@ def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
                 return doubted(status, "something lies across the bat: move it or look past it")
             return status
     return choose(STATES, np.abs(at_foot), noise=noise, seen=seen, what="bat")
+
+
+def _aside_m(patch: Patch, spec: Toggle) -> float:
+    """Return by how much the axis of the bat lies to the right of its place in the registered panel, m."""
+
+    def stands_out(radii: float) -> float:
+        aside_m = radii * spec.bat_radius_m
+        contrast = [_bat(patch, spec, angle, FLANK, aside_m) for angle in LEANS]
+        return float(np.abs(contrast).max()) * (1.0 - ASIDE_COST * abs(radii))
+
+    return spec.bat_radius_m * max(ASIDE, key=stands_out)
 
 
 def _of_one_colour(contrast: Array) -> Array:
@@ -55,34 +71,40 @@ def _of_one_colour(contrast: Array) -> Array:
     return np.asarray(max(rivals, key=lambda e: e[0].max() * e[1])[0])
 
 
-def _at_foot(patch: Patch, spec: Toggle, noise: float) -> Array:
+def _at_foot(patch: Patch, spec: Toggle, noise: float, aside_m: float) -> Array:
     """Return the signed contrast (2,) of the bat in front of its nut, towards `LEANS`.
 
     Zeros unless on one side only.
     """
-    contrast = np.array([_stretch(patch, spec, angle, AT_FOOT, FLANK) for angle in LEANS])
+    contrast = np.array([_stretch(patch, spec, angle, AT_FOOT, FLANK, aside_m) for angle in LEANS])
     size = np.abs(contrast)
     stands_out = size.max() > AT_FOOT_NOISE * noise and size.min() < 0.5 * size.max()
     return np.where(size == size.max(), contrast, 0.0) if stands_out else np.zeros(2)
 
 
 def _stretch(
-    patch: Patch, spec: Toggle, angle_rad: float, along: tuple[float, float], flank: tuple[float, float]
+    patch: Patch,
+    spec: Toggle,
+    angle_rad: float,
+    along: tuple[float, float],
+    flank: tuple[float, float],
+    aside_m: float,
 ) -> float:
     """Return the signed contrast of a stretch of a bat that leans towards an angle.
 
-    `along`: shares of the bat's length; `flank`: see `FLANK`.
+    `along`: shares of the bat's length; `flank`: see `FLANK`; `aside_m`: see `_aside_m`.
     """
     reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
     first, last = along
     contrast = bar_contrast(
         patch, angle_rad, along_m=(first * reach, last * reach), half_width_m=0.8 * spec.bat_radius_m, quantile=0.5,
         height_m=(PIVOT_M + first * height, PIVOT_M + last * height), flank=flank,
+        beside_m=aside_m * float(np.cos(angle_rad)),
     )  # fmt: skip
     return float(contrast[0])
 
 
-def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float]) -> float:
+def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float], aside_m: float) -> float:
     """Return the signed contrast of a bat that leans towards an angle, minus that of its continuation.
 
     The continuation is beyond the tip or behind the foot. A bat ends there. A cable does not, nor does the bat in its
@@ -90,7 +112,7 @@ def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float
     """
     reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
 
-    bat = _stretch(patch, spec, angle_rad, (BAT_FROM, BAT_TO), flank)
+    bat = _stretch(patch, spec, angle_rad, (BAT_FROM, BAT_TO), flank, aside_m)
     foot, tip = (
         np.array(patch.pixel_of(k * reach * np.sin(angle_rad), k * reach * np.cos(angle_rad), PIVOT_M + k * height))
         for k in (0.0, 1.0)
@@ -101,7 +123,7 @@ def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float
     if radii > 1.0:
         return bat  # seen from its end, the bat has no length
     beyond, behind = (
-        _stretch(patch, spec, angle_rad, along, flank)
+        _stretch(patch, spec, angle_rad, along, flank, aside_m)
         for along in ((1.0 + BEYOND[0] * radii, 1.0 + BEYOND[1] * radii), (-BEHIND[1] * radii, -BEHIND[0] * radii))
     )
     goes_on = max(beyond, 0.0) if bat > 0 else max(-beyond, -behind, 0.0)  # behind a bright bat its nut may reflect

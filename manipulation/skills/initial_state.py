@@ -25,6 +25,7 @@ class InitialState:
 
     Attributes:
         is_sure: whether every observation so far has shown one possible place, neither none nor several.
+        sigma: one standard deviation of the newest observation that showed it.
     """
 
     def __init__(
@@ -43,8 +44,9 @@ class InitialState:
         self._place: float | None = None
         self._between = (0.0, 0.0)  # least and largest motion since the newest observation
         self.is_sure = True
+        self.sigma = 0.0
         if current is not None:
-            self._place = place_of(current)
+            self._place, self.sigma = place_of(current), current.sigma
         elif verify is not None:
             self._look()
 
@@ -83,8 +85,8 @@ class InitialState:
         place = self._place_of(seen) if seen is not None else None
         if place is not None and self._place is not None and self._period is not None:
             place = self._only_possible(place, self._place, self._period)
-        if place is not None:
-            self._place, self._between = place, (0.0, 0.0)
+        if seen is not None and place is not None:
+            self._place, self._between, self.sigma = place, (0.0, 0.0), seen.sigma
         return seen
 
     def _only_possible(self, seen: float, known: float, period: float) -> float:

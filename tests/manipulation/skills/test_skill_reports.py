@@ -32,7 +32,7 @@ from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 from manipulation.skills.probe import proximity_probe
 from manipulation.skills.retreat import PULLS, park, retreat, step_back
-from manipulation.skills.slider import between_witnesses
+from manipulation.skills.slider import Felt, between_witnesses
 from manipulation.skills.toggle import toggle
 from tests.manipulation.arms import T3
 from tests.manipulation.rig import HOME
@@ -242,6 +242,9 @@ def test_a_distance_that_few_samples_saw_is_none() -> None:
 def test_a_slider_is_done_only_where_look_and_push_agree() -> None:
     """A look that was 3 mm off said `done` of a slider that stood 2.4 % beside its goal."""
     scale = Scale(minimum=0.0, maximum=100.0, unit="%", at_min=-0.05, at_max=0.05)
-    assert between_witnesses(scale, 70.0, 0.0195) == ""
-    assert "the push was felt to end at 66.5, 3.5 mm apart" in between_witnesses(scale, 70.0, 0.0165)
-    assert between_witnesses(scale, 70.0, None) and between_witnesses(scale, None, 0.02)
+    seen, unseen = ObjectState(name="setpoint", value=70.0, sigma=0.3), ObjectState(name="setpoint")
+    assert between_witnesses(scale, seen, Felt(value=69.5, sigma=0.4)) == ""
+    disagreed = between_witnesses(scale, seen, Felt(value=66.5, sigma=0.4))
+    assert "the push was felt to end at 66.5, 3.5 mm apart" in disagreed
+    assert between_witnesses(scale, seen, None)
+    assert between_witnesses(scale, unseen, Felt(value=70.0, sigma=0.4))

@@ -37,8 +37,10 @@ END_RISE_N, HEAVY_RISE_N = 8.0, 4.0  # the stop of a heavy bar is met with littl
 SHORT_RAD = np.radians(1.0)
 STOP_TRIES = 3
 EASY_N = 35.0  # a bar that gives way below this is turned at once; a heavier one is loaded slowly first
-LOAD_M_PER_S = 0.02  # at 80 mm/s the force overshoots by 30 N before the arm has stopped
-LARGEST_N = 82.0  # tells a stiff valve from a collision; the force rises by 2 to 3 N after it was seen
+LARGEST_N = 84.0  # tells a stiff valve from a collision
+#: Force up to which a bar is loaded, and the speed: at 80 mm/s it overshoots by 30 N before the arm has stopped.
+FIRM_N, FIRM_M_PER_S = 70.0, 0.02
+LOADS = ((FIRM_N, FIRM_M_PER_S), (LARGEST_N, 0.006))
 LARGEST_WITH_FRICTION_N = 92.0
 FELT_RATIO, FELT_N = 1.25, 12.0  # a bar that needs more than this multiple of the felt force plus this much has stalled
 FELT_SAMPLES = 12  # of the log, a tenth of a second
@@ -101,7 +103,12 @@ def lever(
         turn = _Turn(start_rad=where.known, goal_rad=goal)
         if abs(turn.span_rad) < np.radians(2.0):
             return turn.start_rad
-        return _turn_lever(attempt, valve, turn)
+        try:
+            return _turn_lever(attempt, valve, turn)
+        except SkillFailure as failure:
+            if failure.reached is not None:  # a bar between two states is often not read
+                where.moved_to(failure.reached)
+            raise
 
     return perform(
         context,
@@ -224,9 +231,13 @@ def _turn_most(attempt: Attempt, way: _Arc, start: RigidTransform, fast_rad: flo
     if easy.tripped is None:
         return _felt_n(way, easy)
     give_m = LARGEST_N / attempt.context.hand.pad_stiffness_n_per_m
-    loaded_rad = min(fast_rad, _between(start, easy.base_from_tool) + give_m / way.radius_m)
-    loaded = _turn_to(attempt, way, start, loaded_rad, limit_n=LARGEST_N, speed_m_per_s=LOAD_M_PER_S)
-    if loaded.tripped is not None:
+    loaded = easy
+    for load_n, speed_m_per_s in LOADS:
+        loaded_rad = min(fast_rad, _between(start, loaded.base_from_tool) + give_m / way.radius_m)
+        loaded = _turn_to(attempt, way, start, loaded_rad, limit_n=load_n, speed_m_per_s=speed_m_per_s)
+        if loaded.tripped is None:
+            break
+    else:
         raise _gave_no_way(attempt, way, start, loaded)
     felt_n = _felt_n(way, loaded)
     limit_n = min(LARGEST_N, FELT_RATIO * felt_n + FELT_N)
@@ -239,7 +250,7 @@ def _turn_most(attempt: Attempt, way: _Arc, start: RigidTransform, fast_rad: flo
 def speed_for(felt_n: float) -> float:
     """Return the speed at which a bar that takes `felt_n` is turned: the nearer to the largest force, the slower."""
     share = (LARGEST_N - felt_n) / (LARGEST_N - EASY_N)
-    return float(np.clip(share * STROKE_M_PER_S, LOAD_M_PER_S, STROKE_M_PER_S))
+    return float(np.clip(share * STROKE_M_PER_S, FIRM_M_PER_S, STROKE_M_PER_S))
 
 
 def _felt_n(way: _Arc, report: MotionReport) -> float:

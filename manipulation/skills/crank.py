@@ -16,7 +16,9 @@ from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
 from manipulation.skills.context import panel_from_grip
 
-RIM_MARGIN_M = 0.0022  # between a finger and the rim: the panel's pose and the rim's own shape are known less well
+# Wanted and least space between a finger and the rim: the panel's pose and the rim's own shape are known less well, and
+# friction on the spokes shifts the hand by up to 3 mm in a long turn.
+RIM_MARGINS_M = (0.0045, 0.0022)
 HUB_MARGIN_M = 0.0013
 BEHIND_M = 0.006  # wanted distance between a finger and the spoke that it will push
 LEAST_BEHIND_M = 0.002
@@ -62,9 +64,14 @@ def spoke_holds(wheel: Handwheel, hand: Hand, angle_rad: float, sign: float) -> 
 
     There is none when the fingers do not fit between rim, hub and spokes.
     """
+    wide, narrow = (_holds(wheel, hand, angle_rad, sign, margin_m) for margin_m in RIM_MARGINS_M)
+    return wide or narrow
+
+
+def _holds(wheel: Handwheel, hand: Hand, angle_rad: float, sign: float, rim_margin_m: float) -> tuple[SpokeHold, ...]:
     apart = wheel.spokes // 2  # number of sectors between the two spokes
     alpha = 2.0 * np.pi * apart / wheel.spokes
-    stand = _furthest_m(wheel, hand, alpha)
+    stand = _furthest_m(wheel, hand, alpha, rim_margin_m)
     half, offset = stand * float(np.sin(alpha / 2)), stand * float(np.cos(alpha / 2))
     inner = np.hypot(half - hand.finger_thickness_m / 2, max(0.0, offset - hand.finger_width_m / 2))
     if stand <= 0.0 or inner < wheel.hub_m + HUB_MARGIN_M:
@@ -104,12 +111,12 @@ def _meeting(hand: Hand, half_m: float, offset_m: float, spoke_m: float) -> tupl
     return max(leads), 0.5 * (arms[0] + arms[1])
 
 
-def _furthest_m(wheel: Handwheel, hand: Hand, alpha_rad: float) -> float:
+def _furthest_m(wheel: Handwheel, hand: Hand, alpha_rad: float, rim_margin_m: float) -> float:
     """Return how far from the hub the fingers can stand: their outer corners clear the rim, and the hand opens so far.
 
     (stand sin(alpha/2) + t/2)^2 + (stand cos(alpha/2) + w/2)^2 = free^2 with the finger's thickness t and width w.
     """
-    free = wheel.radius_m - wheel.rim_m - RIM_MARGIN_M
+    free = wheel.radius_m - wheel.rim_m - rim_margin_m
     s, c = float(np.sin(alpha_rad / 2)), float(np.cos(alpha_rad / 2))
     t, w = hand.finger_thickness_m / 2, hand.finger_width_m / 2
     linear = s * t + c * w

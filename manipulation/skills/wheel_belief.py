@@ -61,11 +61,9 @@ class Belief:
         return enough[0] if enough else max(takes, key=lambda hold: takes[hold], default=None)
 
     def grip_across_n(self, wheel: Handwheel) -> float:
-        """Return the force of the pads across the wheel: for the believed effort at first, and the largest after a slip."""
-        if self.grip_n is None:
-            self.grip_n = float(
-                np.clip(SPARE_GRIP * self.effort_nm / (2.0 * POOR_FRICTION * outer_m(wheel)), *GRIP_ACROSS_N)
-            )
+        """Return the force of the pads across the wheel: for the believed effort, and the largest after a slip."""
+        wanted_n = SPARE_GRIP * self.effort_nm / (2.0 * POOR_FRICTION * outer_m(wheel))
+        self.grip_n = float(np.clip(max(wanted_n, self.grip_n or 0.0), *GRIP_ACROSS_N))
         return self.grip_n
 
     def begin(self, seen_rad: float) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hal.arrays import Array
 from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
-from manipulation.skills.crank import HUB_MARGIN_M, RIM_MARGIN_M, SpokeHold, spoke_holds
+from manipulation.skills.crank import HUB_MARGIN_M, RIM_MARGINS_M, SpokeHold, spoke_holds
 
 HAND = Hand()
 WHEELS = [
@@ -54,7 +54,7 @@ def test_fingers_come_down_free_and_meet_both_spokes_at_once(wheel: Handwheel, a
     for hold in spoke_holds(wheel, HAND, angle_rad, sign):
         for points in boundary(wheel, hold, 0.0):
             far = np.linalg.norm(points, axis=1)
-            assert far.max() <= wheel.radius_m - wheel.rim_m - RIM_MARGIN_M + 1e-6
+            assert far.max() <= wheel.radius_m - wheel.rim_m - min(RIM_MARGINS_M) + 1e-6
             assert far.min() >= wheel.hub_m + HUB_MARGIN_M - 1e-4
             assert to_spokes(wheel, angle_rad, points).min() > 0.001
         arms = []

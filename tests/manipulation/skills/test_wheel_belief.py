@@ -51,6 +51,15 @@ def test_a_wheel_that_did_not_follow_is_held_with_all_force_before_another_hold_
     assert belief.failed == {Hold.ACROSS}
 
 
+def test_a_wheel_that_was_felt_to_be_heavier_is_held_more_firmly() -> None:
+    belief = Belief(effort_nm=0.4)
+    first_n = belief.grip_across_n(SMALL)
+    belief.effort_nm = 0.6
+    assert belief.grip_across_n(SMALL) == pytest.approx(1.5 * first_n)
+    belief.effort_nm = 0.3
+    assert belief.grip_across_n(SMALL) == pytest.approx(1.5 * first_n)
+
+
 @pytest.mark.parametrize("seen_rad", [1.5, 1.2, 0.8])
 def test_a_wheel_that_followed_at_least_half_way_has_not_slipped(seen_rad: float) -> None:
     belief = Belief(effort_nm=0.5)

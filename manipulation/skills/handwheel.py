@@ -185,6 +185,9 @@ def _given_up(belief: Belief, seen_rad: float) -> SkillFailure:
         return SkillFailure(
             Outcome.SLIPPED, f"the wheel stopped following the hand at {belief.tried_nm:.1f} N m (holds: {names})"
         )
+    if belief.has_slipped:
+        what = f"the pads slipped at {belief.tried_nm:.1f} N m before the wheel gave way (holds: {names})"
+        return SkillFailure(Outcome.SLIPPED, what)
     return SkillFailure(Outcome.STIFF, f"it did not give way at {belief.tried_nm:.1f} N m (holds: {names})")
 
 

@@ -43,6 +43,7 @@ class Belief:
         failed: holds that were tried in vain.
         grip_n: force of the pads across the wheel; None until the first such hold.
         tried_nm: largest torque that was put on the wheel.
+        has_slipped: whether the pads slipped in a hold, so that the torque at which the wheel gives way is not known.
         lost_rad: by how much less the wheel turns in a hold than is felt, because it springs back when it is let go.
     """
 
@@ -50,6 +51,7 @@ class Belief:
     failed: set[Hold] = field(default_factory=set)
     grip_n: float | None = None
     tried_nm: float = 0.0
+    has_slipped: bool = False
     lost_rad: float = 0.0
     _first_rad: float | None = None
     _last: tuple[Hold, float, float] | None = None
@@ -101,6 +103,7 @@ class Belief:
 
     def slipped(self, hold: Hold) -> None:
         """Note that the pads slipped."""
+        self.has_slipped = True
         if hold is Hold.ACROSS and (self.grip_n or 0.0) < 0.9 * GRIP_ACROSS_N[1]:
             self.grip_n = GRIP_ACROSS_N[1]
         else:

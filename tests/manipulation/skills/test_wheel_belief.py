@@ -93,3 +93,6 @@ def test_a_wheel_that_never_moved_is_named_stiff_with_the_largest_torque_and_one
     still, moved = _given_up(belief, 1.05), _given_up(belief, 1.6)
     assert (still.outcome, moved.outcome) == (Outcome.STIFF, Outcome.SLIPPED)
     assert "2.9 N m (holds: across, rim, spokes)" in still.cause
+    belief.slipped(Hold.RIM)
+    slipped = _given_up(belief, 1.05)
+    assert slipped.outcome is Outcome.SLIPPED and "the pads slipped at 2.9 N m before" in slipped.cause

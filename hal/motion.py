@@ -24,7 +24,8 @@ class Quantity(StrEnum):
     """The quantity that a guard watches."""
 
     FORCE = "force"  # N, along `axis` of the tool, or the norm when the axis is None
-    TORQUE = "torque"  # N m, likewise
+    RESISTANCE = "resistance"  # N, norm of the force without what pushes the tip the way it is commanded to go
+    TORQUE = "torque"  # N m, likewise, as the force
     FORCE_RISE = "force-rise"  # N above the running median of the last 0.4 s, along `axis` or the norm
     TOUCH = "touch"  # number of channels in contact
     PROXIMITY = "proximity"  # m, nearest of all valid proximity readings

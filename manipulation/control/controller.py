@@ -269,6 +269,7 @@ class Controller:
             force_limit_n(motion, self._safety.force_limit_n),
             look,
             arm=self._devices.arm.name,
+            is_retreat=is_retreat(motion),
             is_latched=self._way_back.must_end if self._way_back.is_going else self._is_latched,
             is_cancelled=lambda: not self._way_back.is_going and (self._is_closing or self._cancel.is_set()),
         )

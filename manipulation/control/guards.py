@@ -17,6 +17,7 @@ RISE_WINDOW_S = 0.4
 RISE_AFTER_S = 0.15  # a motion that begins under load first builds up that load; a networked arm needs 50 ms more
 PADS_N_PER_M = 10_000.0  # of soft pads in contact; the rise that is measured flickers too much to foresee anything
 AHEAD_SHARE = 0.4  # of the limit, from which on there is contact that can rise
+STILL = np.zeros(3)
 RISE_SAMPLE_S = 0.016  # the running median is updated at 62 Hz; the force of a contact rises within a few updates
 
 
@@ -30,6 +31,14 @@ class Measured:
     commanded_tip_m: Array
     contacts: tuple[bool, ...]
     proximity_m: tuple[float, ...]
+
+
+def _resistance(now: Measured, step_m: Array) -> float:
+    """Return the contact force (N) without what pushes the tip along a commanded step (3,), base frame."""
+    force = now.base_from_tool[:3, :3] @ now.wrench[:3]
+    square = float(step_m @ step_m)
+    along = max(0.0, float(force @ step_m))
+    return math.sqrt(max(0.0, float(force @ force) - (along * along / square if square > 0.0 else 0.0)))
 
 
 class GuardSet:
@@ -58,28 +67,37 @@ class _GuardMonitor:
         self._next_s = RISE_AFTER_S
         self._median: float | None = None
         self._last: tuple[float, Array] | None = None
+        self._wants_step = guard.ahead_s > 0.0 or guard.quantity is Quantity.RESISTANCE
 
     def holds(self, now: Measured) -> bool:
-        value = self._value(now)
-        if self.guard.ahead_s > 0.0:
-            value += self._ahead(now, value)
+        elapsed_s, step_m = self._since_last(now) if self._wants_step else (0.0, STILL)
+        value = self._value(now, step_m)
+        if elapsed_s > 0.0 and self.guard.ahead_s > 0.0:
+            value += self._ahead(value, math.sqrt(float(step_m @ step_m)) / elapsed_s)
         beyond = value <= self.guard.limit if self.guard.below else value >= self.guard.limit
         # NaN compares false, so "nothing in range" never trips a guard.
         self._held = self._held + 1 if beyond else 0
         return self._held >= self.guard.ticks
 
-    def _ahead(self, now: Measured, value: float) -> float:
-        """Return what the force rises by in `ahead_s` at the speed of the last commanded step, while there is contact."""
+    def _since_last(self, now: Measured) -> tuple[float, Array]:
+        """Return the time since the last tick, s, and the step (3,) of the tip that was commanded in it, m."""
         last, self._last = self._last, (now.elapsed_s, now.commanded_tip_m)
-        if last is None or now.elapsed_s <= last[0] or value < AHEAD_SHARE * self.guard.limit:
-            return 0.0
-        step = now.commanded_tip_m - last[1]
-        return PADS_N_PER_M * math.sqrt(float(step @ step)) / (now.elapsed_s - last[0]) * self.guard.ahead_s
+        if last is None or now.elapsed_s <= last[0]:
+            return 0.0, STILL
+        return now.elapsed_s - last[0], now.commanded_tip_m - last[1]
 
-    def _value(self, now: Measured) -> float:
+    def _ahead(self, value: float, speed_m_per_s: float) -> float:
+        """Return what the force rises by in `ahead_s` at the speed of the last commanded step, while there is contact."""
+        if value < AHEAD_SHARE * self.guard.limit:
+            return 0.0
+        return PADS_N_PER_M * speed_m_per_s * self.guard.ahead_s
+
+    def _value(self, now: Measured, step_m: Array) -> float:
         match self.guard.quantity:
             case Quantity.FORCE:
                 return self._along(now.wrench[:3])
+            case Quantity.RESISTANCE:
+                return _resistance(now, step_m)
             case Quantity.TORQUE:
                 return self._along(now.wrench[3:])
             case Quantity.FORCE_RISE:

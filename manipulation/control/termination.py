@@ -35,6 +35,7 @@ SETTLED_RAD = 2e-4
 SETTLED_RAD_PER_S = 0.02
 UNITS = {
     Quantity.FORCE: "N",
+    Quantity.RESISTANCE: "N",
     Quantity.TORQUE: "N m",
     Quantity.FORCE_RISE: "N",
     Quantity.TOUCH: "contacts",
@@ -63,6 +64,8 @@ class TerminationMonitor:
         force_limit_n: limit of the contact force, which holds in every motion.
         look: the measurement at the start of the motion.
         arm: name of the device that is at fault when the arm does not follow.
+        is_retreat: whether what pushes the hand the way it goes is no reason to end the motion: a door that swings towards
+            a hand goes on pushing a hand that stands.
         is_latched, is_cancelled: called every tick.
     """
 
@@ -73,10 +76,13 @@ class TerminationMonitor:
         look: ToolReading,
         *,
         arm: str,
+        is_retreat: bool = False,
         is_latched: Callable[[], bool],
         is_cancelled: Callable[[], bool],
     ) -> None:
-        self._guards = GuardSet((*declared, *_standing_guards(force_limit_n, look.wrench)), look.base_from_tool)
+        self._guards = GuardSet(
+            (*declared, *_standing_guards(force_limit_n, look.wrench, is_retreat=is_retreat)), look.base_from_tool
+        )
         self._arm = arm
         self._is_latched = is_latched
         self._is_cancelled = is_cancelled
@@ -133,7 +139,7 @@ def speed_limit_m_per_s(motion: DeclaredMotion, safety: SafetySection, *, is_red
     return min(limits)
 
 
-def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
+def _standing_guards(force_limit_n: float, wrench: Array, *, is_retreat: bool) -> tuple[Guard, ...]:
     """Return the guards of every motion: force and tracking.
 
     A motion that begins beyond the limit may go on while the load does not grow. The force limit foresees what the force
@@ -144,7 +150,7 @@ def _standing_guards(force_limit_n: float, wrench: Array) -> tuple[Guard, ...]:
     return (
         Guard(
             name="force_limit",
-            quantity=Quantity.FORCE,
+            quantity=Quantity.RESISTANCE if is_retreat else Quantity.FORCE,
             limit=force_n,
             reaction=Reaction.FAULT,
             ahead_s=STOPPING_S,

@@ -116,7 +116,7 @@ def press_once(
         is_reached=is_reached,
         verify=verify,
         attempts=2 if is_there else MAX_ATTEMPTS,
-        repeats=is_there,
+        repeats=lambda: is_there,
     )
 
 

@@ -28,7 +28,7 @@ def perform(
     doubt: Callable[[ObjectState], str] = lambda _: "",
     verify: Verify | None,
     attempts: int = MAX_ATTEMPTS,
-    repeats: bool = True,
+    repeats: Callable[[], bool] = lambda: True,
 ) -> SkillReport:
     """Try a stroke, retreat, read back, and try at most twice more while the read-back does not show the target.
 
@@ -37,8 +37,8 @@ def perform(
 
     Args:
         doubt: why a look that does not show the target does not show the contrary either; nothing if it does.
-        repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees. Not for a
-            button, whose second press undoes the first.
+        repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees, asked after each.
+            Not for a button, whose second press undoes the first.
 
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on; the caller parks when that is possible.
@@ -66,10 +66,10 @@ def perform(
                 cause += REFUSED if verify is not None else NO_READING if cause == ENDED else ""
                 break
             outcome, cause = _denied(doubt(seen))
-        if outcome is Outcome.STALLED and seen is None and not repeats:
+        if outcome is Outcome.STALLED and seen is None and not repeats():
             cause += "; it is unknown whether it had an effect, and another try might undo it"
             break
-        if outcome is Outcome.STIFF or (not repeats and outcome in (Outcome.SLIPPED, Outcome.UNVERIFIED)):
+        if outcome is Outcome.STIFF or (outcome in (Outcome.SLIPPED, Outcome.UNVERIFIED) and not repeats()):
             break
     return SkillReport(
         skill=skill, object=object_name, target=target, outcome=outcome, cause=cause, reached=reached, seen=seen,

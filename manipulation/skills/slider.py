@@ -102,6 +102,7 @@ def slider(
     allowed = TOLERANCE_RATIO * (scale.maximum - scale.minimum)
 
     pushed: list[Felt] = []
+    disagreed: list[str] = []
 
     def stroke(attempt: Attempt) -> float:
         pushed.clear()
@@ -112,7 +113,8 @@ def slider(
 
     def is_reached(seen: ObjectState) -> bool:
         felt = pushed[0] if pushed else None
-        if felt is None or between_witnesses(scale, seen, felt):
+        is_too_unsure = SURE * seen.sigma > allowed  # it would contradict nothing
+        if felt is None or is_too_unsure or between_witnesses(scale, seen, felt):
             return False
         return any(surely_within(one.value, target, allowed, sigma=one.sigma) for one in (seen, felt))
 
@@ -120,7 +122,9 @@ def slider(
         doubtful = doubt_within(seen.value, target, allowed, sigma=seen.sigma)
         if not doubtful and not surely_within(seen.value, target, allowed, sigma=seen.sigma):
             return ""
-        return between_witnesses(scale, seen, pushed[0] if pushed else None) or doubtful
+        between = between_witnesses(scale, seen, pushed[0] if pushed else None)
+        disagreed.append(between)
+        return between or doubtful
 
     return perform(
         context,
@@ -131,6 +135,8 @@ def slider(
         is_reached=is_reached,
         doubt=doubt,
         verify=where.verify,
+        # A look that errs is followed by a push that errs as much, so that the two would agree the next time.
+        repeats=lambda: not any(disagreed),
     )
 
 

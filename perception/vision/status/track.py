@@ -25,7 +25,10 @@ UNEQUAL_M, UNEQUAL_SHARE = 0.0007, 0.005
 CAP_ROOM_M = 0.003  # an end nearer to the cap than this may be the edge of the cap or of its shadow
 BOTH_SIGMA_M = 0.0002  # with both ends; the cap's own building tolerance
 ONE_SIGMA_M = 0.0005  # with one end, as the file does not state by how much the slot is longer than the way
-NONE_SIGMA_M = 0.0008  # RMS error of 43 registered close-ups on random panels
+NONE_SIGMA_M = 0.0008  # without one, where the cap hides both: RMS error of 43 registered close-ups on random panels
+# With an end that is not where it should be seen, within the reach of the search: then the pose is wrong by more, as that of
+# a panel that has just been moved.
+MISSED_SIGMA_M = 0.003
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +58,7 @@ def track_shift(patch: Patch, spec: Slider, *, cap_m: float) -> TrackShift:
             return TrackShift(shift_m=(low + high) / 2, sigma_m=BOTH_SIGMA_M)
     elif len(ends) == 1 and len(seen) == 1:
         return TrackShift(shift_m=seen[0][0], sigma_m=ONE_SIGMA_M)
-    return TrackShift(shift_m=0.0, sigma_m=NONE_SIGMA_M)
+    return TrackShift(shift_m=0.0, sigma_m=MISSED_SIGMA_M if ends else NONE_SIGMA_M)
 
 
 def _end(patch: Patch, spec: Slider, end_m: float) -> tuple[float, float]:

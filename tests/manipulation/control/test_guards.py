@@ -48,6 +48,7 @@ NAN = float("nan")
     [
         (Quantity.FORCE, None, {"wrench": np.array([2.0, -3.0, 6.0, 9.0, 9.0, 9.0])}, 7.0),
         (Quantity.FORCE, Y, {"wrench": np.array([2.0, -3.0, 6.0, 9.0, 9.0, 9.0])}, -3.0),
+        (Quantity.RESISTANCE, None, {"wrench": np.array([2.0, -3.0, 6.0, 9.0, 9.0, 9.0])}, 7.0),
         (Quantity.TORQUE, None, {"wrench": np.array([9.0, 9.0, 9.0, 2.0, -3.0, 6.0])}, 7.0),
         (Quantity.TORQUE, Y, {"wrench": np.array([9.0, 9.0, 9.0, 2.0, -3.0, 6.0])}, -3.0),
         (Quantity.TOUCH, None, {"contacts": (True, False)}, 1.0),
@@ -164,6 +165,29 @@ def test_a_guard_that_means_a_fault_ends_in_one_and_says_at_most_or_at_least() -
 def test_the_force_limit_always_holds_and_a_start_beyond_it_may_hardly_grow(loaded_n: float, limit_n: float) -> None:
     for force_n, outcome in ((limit_n - 1e-6, None), (limit_n + 1e-6, MotionOutcome.FAULT)):
         assert endings(watch(at_start=look(loaded_n)), look(force_n), 2) == [None, outcome]
+
+
+@pytest.mark.parametrize(
+    ("force_n", "expected"),
+    [((0.0, 0.0, -140.0), None), ((0.0, 0.0, 140.0), MotionOutcome.FAULT), ((140.0, 0.0, -140.0), MotionOutcome.FAULT)],
+)
+def test_a_hand_that_is_pushed_out_goes_on_with_its_retreat(
+    force_n: tuple[float, float, float], expected: MotionOutcome | None
+) -> None:
+    """The tool's z is the base's, and the retreat goes along -z: what pushes along +z or across resists it."""
+    pushed = TerminationMonitor(
+        (), 100.0, look(), arm="arm", is_retreat=True, is_latched=lambda: False, is_cancelled=lambda: False
+    )
+    ends = []
+    for tick in range(1, 6):
+        seen = replace(
+            look(),
+            wrench=np.array([*force_n, 0.0, 0.0, 0.0]) * (tick > 1),
+            commanded_tip_m=START.translation - [0.0, 0.0, 1e-4 * tick],
+        )
+        ends.append(pushed.ending(0.002 * tick, SAMPLE, seen))
+    outcomes = {end.outcome for end in ends if end is not None}
+    assert outcomes == ({expected} if expected else set())
 
 
 @pytest.mark.parametrize(("cell_n", "transfer_n"), [(100.0, TRANSFER_FORCE_N), (20.0, 20.0)])

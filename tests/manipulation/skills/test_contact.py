@@ -170,7 +170,7 @@ def test_nothing_outside_the_tolerance_is_confirmed_by_an_error_of_two_sigmas(
 def test_a_second_press_never_undoes_the_first() -> None:
     looks = iter([OFF, OFF, OFF])
     result = perform(
-        context(COMPLETED), lambda attempt: 1.0, skill="s", object_name="o", target="on", repeats=False,
+        context(COMPLETED), lambda attempt: 1.0, skill="s", object_name="o", target="on", repeats=lambda: False,
         is_reached=lambda seen: seen.state == "on", verify=lambda: next(looks),
     )  # fmt: skip
     assert result.outcome is Outcome.SLIPPED and result.attempts == 1

@@ -16,7 +16,7 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -142,7 +142,7 @@ def _knob(bench: SimBench) -> Judged:
     sigma = KNOB_SIGMA_RAD * scale.span / abs(scale.at_max - scale.at_min)
 
     def look() -> ObjectState:
-        return replace(bench.look("speed", value_sigma=sigma), sigma=sigma)
+        return bench.look("speed", value_sigma=sigma)
 
     report = bench.operate("speed", goal, current=look(), verify=look)
     error = float(bench.truth("speed").value or 0.0) - goal

@@ -67,6 +67,7 @@ class SimBench:
             state=truth.state,
             value=truth.value + value_sigma * float(self.rng.standard_normal()),
             angle_rad=truth.value + angle_sigma_rad * float(self.rng.standard_normal()),
+            sigma=value_sigma,
         )
 
     def operate(

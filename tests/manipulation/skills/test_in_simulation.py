@@ -42,7 +42,7 @@ def test_a_touch_finds_the_true_plate_although_the_pose_is_wrong(bench: SimBench
 @pytest.mark.parametrize("skill", ["button", "toggle", "slider", "lever"])
 def test_a_skill_does_what_it_says(bench: SimBench, skill: str) -> None:
     report, is_right, _ = SKILLS[skill](bench)
-    assert (report.outcome is Outcome.DONE) == is_right
+    assert (report.outcome is Outcome.DONE) == is_right, report.cause
     assert is_right, report.cause
     assert report.peak_force_n < 100.0
     park(bench.context)

@@ -59,13 +59,19 @@ class SpokeHold:
         return panel_from_grip(point, -angle + (np.pi if flip else 0.0))
 
 
-def spoke_holds(wheel: Handwheel, hand: Hand, angle_rad: float, sign: float) -> tuple[SpokeHold, ...]:
+def spoke_holds(
+    wheel: Handwheel, hand: Hand, angle_rad: float, sign: float, *, least_arm_m: float = np.inf
+) -> tuple[SpokeHold, ...]:
     """Return the holds with which the wheel at `angle_rad` can be turned clockwise (`sign` 1) or back (-1).
 
     There is none when the fingers do not fit between rim, hub and spokes.
+
+    Args:
+        least_arm_m: distance from the hub at which the push is enough; the fingers stand further from the rim if they then
+            push no nearer to the hub than this.
     """
     wide, narrow = (_holds(wheel, hand, angle_rad, sign, margin_m) for margin_m in RIM_MARGINS_M)
-    return wide or narrow
+    return wide if wide and wide[0].arm_m >= least_arm_m else narrow
 
 
 def _holds(wheel: Handwheel, hand: Hand, angle_rad: float, sign: float, rim_margin_m: float) -> tuple[SpokeHold, ...]:

@@ -22,12 +22,13 @@ from manipulation.skills.outcome import (
     surely_within,
 )
 from manipulation.skills.repeat import perform
-from manipulation.skills.wheel_belief import Belief, Hold
+from manipulation.skills.wheel_belief import PUSH_N, Belief, Hold
 from manipulation.skills.wheel_hold import behind_two_spokes, hold_across, hold_the_rim
 from manipulation.skills.wheel_turn import WheelTurn
 
 DRAGGED_RAD = 0.2  # largest turn by which a hand that lets go drags the wheel back
 GAINED_RAD = 0.3  # a wheel that stopped after a turn of so much is turned on
+SPARE_PUSH = 1.3  # of the torque behind spokes, in multiples of the believed one
 TOLERANCE_RAD = np.radians(6.0)
 AT_STOP_RAD = 0.35
 SAME_RAD = 0.6  # a look that differs by more from where the wheel was left shows that somebody else has turned it
@@ -206,7 +207,8 @@ def _turn_once(
             case Hold.ACROSS:
                 turn, part_rad = hold_across(attempt, wheel, angle_rad, span_rad, belief)
             case Hold.SPOKES:
-                holds = spoke_holds(wheel, attempt.context.hand, angle_rad, sign)
+                enough_m = SPARE_PUSH * belief.effort_nm / (2.0 * PUSH_N)
+                holds = spoke_holds(wheel, attempt.context.hand, angle_rad, sign, least_arm_m=enough_m)
                 turn, part_rad = behind_two_spokes(attempt, wheel, holds, span_rad)
             case Hold.RIM:
                 turn, part_rad = hold_the_rim(attempt, wheel, angle_rad, span_rad, belief.effort_nm)

@@ -51,7 +51,9 @@ def to_spokes(wheel: Handwheel, angle_rad: float, points: Array) -> Array:
 
 @pytest.mark.parametrize(("wheel", "angle_rad", "sign"), WHEELS)
 def test_fingers_come_down_free_and_meet_both_spokes_at_once(wheel: Handwheel, angle_rad: float, sign: float) -> None:
-    for hold in spoke_holds(wheel, HAND, angle_rad, sign):
+    furthest, wide = (spoke_holds(wheel, HAND, angle_rad, sign, least_arm_m=least_m) for least_m in (np.inf, 0.0))
+    assert all(one.arm_m <= other.arm_m for one, other in zip(wide, furthest, strict=True))
+    for hold in (*furthest, *wide):
         for points in boundary(wheel, hold, 0.0):
             far = np.linalg.norm(points, axis=1)
             assert far.max() <= wheel.radius_m - wheel.rim_m - min(RIM_MARGINS_M) + 1e-6

@@ -1,4 +1,4 @@
-"""Reader of seven-segment displays in photographs: a crop, or a scene in which the display is searched for first."""
+"""Reader of displays in photographs: seven-segment digits or the drums of a counter, cropped or somewhere in a scene."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hal.arrays import Image
 from perception.vision.image import as_gray
 from perception.vision.photographs.digit_search import DigitRow, find_digit_rows
+from perception.vision.photographs.drum_search import read_counter_in
 from perception.vision.reading import ANSWER_AT, PatchReading, answer_at, gated, limited, refused
 from perception.vision.status.digit_grid_worth import slant_energies
 from perception.vision.status.display import read_window
@@ -24,6 +25,7 @@ TURNS = np.tan(np.deg2rad(np.arange(-8.0, 8.1, 1.0)))  # tangents of the tried r
 RIVAL = 0.3  # weight of other texts read nearby, which lower the confidence
 ROW = 0.35  # weight, relative to that of a crop's reading, of a row of digits in it with another text
 FEW, FEW_OF_SCENE = 4.0, 5.6  # numbers of segments, see `_agreed`; in scenes fewer segments give less confidence
+OF_DRUMS = 0.75  # highest confidence of a counter, whose number of drums is not known
 FRAME = 0.08  # of a crop's height, which a frame may cover
 
 
@@ -41,9 +43,14 @@ def read_photographed_display(image: NDArray[Any], *, scene: bool, least_confide
     gray = as_gray(image)
     rows = [(share, answer) for window in _rows(gray) for share, answer in _read(window)]
     answers = rows if scene else _with_rows([pair for window in _crops(gray) for pair in _read(window)], rows)
-    if not answers:
+    seven = _agreed(answers, FEW_OF_SCENE if scene else FEW) if answers else None
+    found = [] if seven is None else [seven]
+    if seven is None or not (seven.answered and seven.confidence > OF_DRUMS):
+        counter = read_counter_in(gray)
+        found += [] if counter is None else [limited(counter, OF_DRUMS)]
+    if not found:
         return refused("no display is found in the picture: crop it, or come closer")
-    return answer_at(_agreed(answers, FEW_OF_SCENE if scene else FEW), least_confidence)
+    return answer_at(max(found, key=lambda answer: answer.confidence), least_confidence)
 
 
 def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, PatchReading]]:

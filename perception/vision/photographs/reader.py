@@ -32,7 +32,7 @@ def read_photograph(
     Args:
         image: (H, W) gray or (H, W, 3) RGB uint8.
         kind: `gauge`: a pointer over a part of a turn; `dial`: a pointer over a full turn that begins straight up, as
-            in a water meter; `display`: seven-segment digits.
+            in a water meter; `display`: seven-segment digits, or the drums of a counter.
         scale: values at the ends of a gauge's or a dial's scale, in the clockwise sense; the first is the greater one
             where the values fall clockwise.
         ends_rad: pointer angles of a gauge there, clockwise from straight up. If None, they are the ends of the ticks,

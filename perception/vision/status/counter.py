@@ -138,6 +138,12 @@ def read_counter(patch: Patch, spec: Counter) -> PatchReading:
     return gated(status)
 
 
+def alike_drum(patch: Patch, spec: Counter) -> float:
+    """Return the correlation of the drum in the middle of a patch with the digit that it resembles most."""
+    x, _ = _grid(spec, 0)
+    return float(_scores(_cell(patch, spec, 0.0), x.shape[1]).max())
+
+
 def find_drums(scores: Float32) -> Drums:
     """Find the most likely digits.
 

@@ -68,6 +68,16 @@ def answer(
     console.print(f"reading {number} is answered: {verdict}", markup=False)
 
 
+@app.command()
+def teach(
+    number: Annotated[int, typer.Argument(help="Number of an answered reading.")], *, url: Url = UrlDefault
+) -> None:
+    """Teach blind recognition what the object of an answered reading looks like."""
+    taught = client_of(url).post(f"/v1/review/{number}/teach", {})
+    told = f"wrote {taught['path']}" if taught["added"] else f"this look of {taught['name']} is known already"
+    console.print(told, markup=False)
+
+
 def _guess(item: dict[str, Any]) -> str:
     shown = [str(word) for word in (item["guess"] or {}).values() if word is not None][:1]
     rivals = [f"{rival['text']} ({rival['probability']:.0%})" for rival in item["rivals"][:3]]

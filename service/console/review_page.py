@@ -61,6 +61,8 @@ class _Desk:
             self._other.on("keydown.enter", self._send_other)
             button(say("review.send"), self._send_other, look="plain")
             self._you = you_field(mirror).style("min-width:16rem")
+            self._teaches = ui.switch(say("review.teach"))
+            self._teaches.set_visibility(mirror.may(Role.MAINTAINER))
         ui.html(say("review.says"), sanitize=False, tag="p").classes("quiet")
         ui.keyboard(self._key, repeating=False, ignore=["input", "select", "textarea"])
 
@@ -106,12 +108,21 @@ class _Desk:
         number = item["reading"]["id"]
         given = {"by": who, "reason": say("review.reason"), **body}
         try:
-            if await attempt(lambda: self._mirror.client.post(f"/v1/review/{number}", given)) is not None:
+            is_stored = await attempt(lambda: self._mirror.client.post(f"/v1/review/{number}", given)) is not None
+            if is_stored:
                 self._answered += 1
                 self._over.add(number)
                 self._other.set_value("")
         finally:
             self._is_sending = False
+        if is_stored and self._teaches.value and body["verdict"] != "unreadable":
+            await self._teach(number)
+
+    async def _teach(self, number: int) -> None:
+        """Give an answered reading to the teaching of looks, and say what came of it."""
+        taught = await attempt(lambda: self._mirror.client.post(f"/v1/review/{number}/teach", {}))
+        if taught is not None:
+            ui.notify(say("review.taught" if taught["added"] else "review.known", kind=taught["name"]), type="positive")
 
     def _object(self, item: dict[str, Any]) -> PanelObject | None:
         panel, name = self._mirror.panel, item["reading"]["object"]

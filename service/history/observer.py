@@ -14,16 +14,31 @@ if TYPE_CHECKING:
     from perception.vision import ObjectReading
 
 
+Surroundings = Callable[[str], bytes | None]
+
+
+def nothing_around(_name: str) -> bytes | None:
+    """Return None: no surroundings are known."""
+    return None
+
+
 class Observer(Protocol):
     """What an operation tells about the objects that it reads and operates."""
 
     def saw(
-        self, readings: Iterable[ObjectReading], crops: Mapping[str, bytes], *, mission: str = "", phase: str = ""
+        self,
+        readings: Iterable[ObjectReading],
+        crops: Mapping[str, bytes],
+        surroundings: Surroundings = nothing_around,
+        *,
+        mission: str = "",
+        phase: str = "",
     ) -> None:
         """Keep the readings; they are durable when this returns, and may be reported.
 
         Args:
             crops: PNG picture of each object, by its name.
+            surroundings: returns a PNG picture of an object and the plate around it; asked for doubted readings only.
             mission: name of the mission's report.
             phase: part of the work, such as `before the actions`.
 
@@ -58,7 +73,13 @@ class NoObserver:
     """Keeps nothing, for operations outside of a service."""
 
     def saw(
-        self, readings: Iterable[ObjectReading], crops: Mapping[str, bytes], *, mission: str = "", phase: str = ""
+        self,
+        readings: Iterable[ObjectReading],
+        crops: Mapping[str, bytes],
+        surroundings: Surroundings = nothing_around,
+        *,
+        mission: str = "",
+        phase: str = "",
     ) -> None:
         """Drop the readings."""
 
@@ -123,7 +144,13 @@ class TaskObserver:
         self._cell_now_s = cell_now_s
 
     def saw(
-        self, readings: Iterable[ObjectReading], crops: Mapping[str, bytes], *, mission: str = "", phase: str = ""
+        self,
+        readings: Iterable[ObjectReading],
+        crops: Mapping[str, bytes],
+        surroundings: Surroundings = nothing_around,
+        *,
+        mission: str = "",
+        phase: str = "",
     ) -> None:
         """Store the readings, then let the listeners see them; see `Observer.saw`."""
         utc_s, cell_s = self._kept.now_s(), self._cell_now_s()
@@ -141,6 +168,9 @@ class TaskObserver:
             for reading in readings
         ]
         stored = [replace(one, doubt=self._kept.doubt_of(one)) for one in stored]
+        for one in stored:
+            if one.doubt and one.crop is not None and (around := surroundings(one.object)) is not None:
+                self._kept.history.crops.add_surroundings(one.crop, around)
         stored = [replace(one, certificate=self._kept.certify(one, crops.get(one.object))) for one in stored]
         self._kept.history.add(stored)
         for listen in self._kept.listeners:

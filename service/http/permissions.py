@@ -125,6 +125,7 @@ TABLE: dict[str, Row] = {
     "PUT /v1/devices/{name}": MAINTAINER_WRITES,
     "POST /v1/devices/{name}/fault": MAINTAINER_WRITES,
     "POST /v1/knowledge/teach": MAINTAINER_WRITES,
+    "POST /v1/review/{reading}/teach": MAINTAINER_WRITES,
     "DELETE /v1/knowledge/{group}/{name}": MAINTAINER_WRITES,
     "DELETE /v1/calibrations/{name}": MAINTAINER_WRITES,
     "POST /v1/learn": MAINTAINER_TASK,

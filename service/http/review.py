@@ -16,7 +16,9 @@ from service.http.body import body_schema, strict_body
 from service.http.history import HistoryReading, reading_view
 from service.http.models import Holder
 from service.http.problems import RESPONSES
-from service.http.state import State
+from service.http.state import Admitted, AppState, State
+from service.knowledge.store import KnowledgeStore
+from service.knowledge.teach import TaughtView, teach_surroundings
 from service.review.desk import Verdict, held_by
 
 router = APIRouter(prefix="/v1/review", tags=["review"], responses=RESPONSES)
@@ -90,6 +92,23 @@ async def answer_review(state: State, reading: ReadingId, request: Answer) -> Hi
     shows = {"value": request.value, "state": request.state, "text": request.text}
     given: dict[str, Any] = {"by": request.by, "verdict": request.verdict, "reason": request.reason, "shows": shows}
     return reading_view(await state.act(functools.partial(state.service.plant.review.answer, reading, **given)))
+
+
+@router.post(
+    "/{reading}/teach",
+    summary="Teach the look of an answered reading's object, for blind recognition",
+    operation_id="teach_reading",
+)
+async def teach_reading(state: State, _holder: Admitted, reading: ReadingId) -> TaughtView:
+    taught = await state.in_thread(functools.partial(_taught, state, reading))
+    await state.commit("taught", {"what": taught.what, "name": taught.name, "added": taught.added, "reading": reading})
+    return taught
+
+
+def _taught(state: AppState, number: int) -> TaughtView:
+    reading, picture = state.service.plant.review.to_teach(number)
+    store = KnowledgeStore.of_runs(state.service.runs_dir, state.service.cell)
+    return teach_surroundings(store, picture, kind=reading.kind)
 
 
 def _item(row: Row) -> ReviewItem:

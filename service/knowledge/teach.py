@@ -146,12 +146,37 @@ def teach_kind(
     size_m: tuple[float, float] | None = None,
 ) -> TaughtView:
     """Teach one example of a kind and store it; see `teach`."""
-    from perception.vision.teaching import example_at, overview_of, teach_example
+    from perception.vision.teaching import example_at, overview_of
 
     check_name(kind)
     overview = overview_of(pixels, plate_m=plate_m)
     example = example_at(overview, clicks_px, kind=kind)
-    lesson = teach_example(example, store.knowledge(), kind=kind, size_m=size_m, source="panelwright teach")
+    taught = _stored(store, example, kind=kind, size_m=size_m, source="panelwright teach")
+    return (
+        taught
+        if example.outline is None
+        else taught.model_copy(update={"outline": described(overview, example, store)})
+    )
+
+
+def teach_surroundings(store: KnowledgeStore, picture: bytes, *, kind: str) -> TaughtView:
+    """Teach the look of the object in the middle of its surroundings, which the history keeps of a doubted reading.
+
+    Raises:
+        PerceptionError: as for `teach`.
+    """
+    from perception.vision import decode
+    from perception.vision.teaching import example_in
+
+    return _stored(store, example_in(decode(picture)), kind=kind, source="panelwright review")
+
+
+def _stored(
+    store: KnowledgeStore, example: Example, *, kind: str, source: str, size_m: tuple[float, float] | None = None
+) -> TaughtView:
+    from perception.vision.teaching import teach_example
+
+    lesson = teach_example(example, store.knowledge(), kind=kind, size_m=size_m, source=source)
     path = store.write_kind(lesson.kind) if lesson.added else None
     file = next(file for file in store.kinds() if file.name == kind)
     return TaughtView(
@@ -161,7 +186,6 @@ def teach_kind(
         is_new=lesson.is_new_kind,
         path=None if path is None else str(path),
         toml=file.text(),
-        outline=None if example.outline is None else described(overview, example, store),
     )
 
 

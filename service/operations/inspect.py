@@ -14,7 +14,16 @@ from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject
 from manipulation import visiting_order
-from perception.vision import ObjectReading, answer_at, draw_annotated, merge_views, said, viewpoints
+from perception.vision import (
+    CameraProjection,
+    ObjectReading,
+    PanelProjection,
+    answer_at,
+    draw_annotated,
+    merge_views,
+    said,
+    viewpoints,
+)
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, base_from, look, settle
 from service.operations.locate import go_to_overview, locate_from_overview, offset_m
@@ -36,12 +45,13 @@ MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the ligh
 class AnnotatedView:
     """One image for people: upright RGB, uint8 (H, W, 3), with its `readings` drawn in; and the image that it was made from.
 
-    `turns` is by how many quarters to the left the image was turned.
+    `turns` is by how many quarters to the left the image was turned, `view` where the image shows the panel.
     """
 
     title: str
     pixels: NDArray[np.uint8]
     look: Look
+    view: PanelProjection
     readings: tuple[ObjectReading, ...] = ()
     turns: int = 0
 
@@ -66,6 +76,21 @@ class Inspection:
                 if cut is not None and (reading.name not in shown or reading.answered):
                     shown[reading.name] = png_of(turned_image(cut, picture.turns))
         return shown
+
+    def surroundings(self, panel_object: PanelObject) -> bytes | None:
+        """Return a picture (PNG) of an object and the plate around it, for teaching; from the first image, which is frontal.
+
+        None if that image does not show all of it.
+        """
+        from perception.vision.teaching import surroundings
+
+        for picture in self.pictures:
+            for reading in picture.readings:
+                if reading.name == panel_object.name:
+                    centre_px = reading.centre_px if reading.present else [np.nan, np.nan]
+                    found = surroundings(picture.look.pixels, picture.view, panel_object.point_m, centre_px)
+                    return None if found is None else png_of(found)
+        return None
 
 
 def inspect_here(
@@ -94,7 +119,8 @@ def inspect_here(
     session.world.note_readings(readings)
     turns = quarter_turns(camera_from_panel.parent_from_child)
     drawn = _upright_drawing(view, readings, turns)
-    picture = AnnotatedView(title=title, pixels=drawn, look=view, readings=tuple(readings), turns=turns)
+    shows = CameraProjection(intrinsics=view.intrinsics, camera_from_panel=camera_from_panel)
+    picture = AnnotatedView(title=title, pixels=drawn, look=view, view=shows, readings=tuple(readings), turns=turns)
     off_m = offset_m(view, readings, session.known_panel().parent_from_child, session.panel)
     return Inspection(readings={r.name: r for r in readings}, pictures=(picture,), offset_m=off_m)
 
@@ -268,6 +294,17 @@ def ensure_located(session: Session) -> None:
     locate_from_overview(session.part(0.3, 1.0))
 
 
+def tell(
+    session: Session, readings: Iterable[ObjectReading], found: Inspection, *, mission: str = "", phase: str = ""
+) -> None:
+    """Give readings to the observer with what an inspection shows of them; see `Observer.saw`."""
+
+    def around(name: str) -> bytes | None:
+        return found.surroundings(session.panel.object(name))
+
+    session.observer.saw(readings, found.crops(), around, mission=mission, phase=phase)
+
+
 def missing(readings: Iterable[ObjectReading], wanted: Iterable[PanelObject]) -> tuple[str, ...]:
     """Return the names of objects that are not where the panel file says."""
     present = {r.name for r in readings if r.present}
@@ -290,7 +327,7 @@ def need_all_present(found: Inspection, session: Session) -> None:
 
 def _answer(session: Session, found: Inspection, least_confidence: float) -> InspectResult:
     """Return the answer at the caller's least confidence; stored readings and pictures keep the default."""
-    session.observer.saw(found.readings.values(), found.crops())
+    tell(session, found.readings.values(), found)
     readings = [answer_at(reading, least_confidence) for reading in found.readings.values()]
     pictures = [
         session.context.task.artefact(f"annotated-{k}.png", png_of(picture.pixels), "image/png")

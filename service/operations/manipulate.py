@@ -20,7 +20,7 @@ from hal.panel import PanelObject, Shown
 from manipulation import ObjectState, Outcome, SkillReport, Verify, free_hand, operate
 from perception.vision import ObjectReading, said
 from service.feasibility import target_of, text_of
-from service.operations.inspect import ensure_located, look_close, look_past
+from service.operations.inspect import ensure_located, look_close, look_past, tell
 from service.operations.locate import OFF_PLACE_M, look_again
 from service.operations.range_detection import ensure_space_is_known
 from service.operations.session import Session
@@ -290,7 +290,7 @@ class _Eye:
         mission = "" if record is None else record.mission
         if record is not None:
             record.crops |= found.crops()
-        self._session.observer.saw([reading], found.crops(), mission=mission, phase=self._at)
+        tell(self._session, [reading], found, mission=mission, phase=self._at)
         return reading if reading.present and reading.answered else None
 
 

@@ -24,7 +24,7 @@ from service.missions.interpreter import Interpreter, leaves_of
 from service.missions.progress import FILE, Progress, load_progress
 from service.operations.acquisition import Look, settle
 from service.operations.find_panel import Located, locate, panel_observations, ways_of
-from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result
+from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result, tell
 from service.operations.locate import (
     ScannedPlane,
     SeenRim,
@@ -265,7 +265,7 @@ class _Worker:
     def _keep(self, read: Inspection, name: str) -> None:
         """Store readings and pictures; those after a deed say so, because the evaluation compares them with what is then."""
         phase = AFTER if self.record.actions else BEFORE
-        self.session.observer.saw(read.readings.values(), read.crops(), mission=self.record.mission, phase=phase)
+        tell(self.session, read.readings.values(), read, mission=self.record.mission, phase=phase)
         _note_pictures(self.record, read, name)
         self.record.readings += [reading_result(reading, phase) for reading in read.readings.values()]
         self.looks += [view.look for view in read.pictures]

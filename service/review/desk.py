@@ -10,6 +10,7 @@ from typing import Any, Literal
 from hal.errors import InvalidRequest
 from hal.panel import Panel, PanelObject
 from service.access.actor import actor
+from service.errors import NotPossibleNow
 from service.history.query import Row
 from service.history.reading import StoredReading
 from service.history.store import History
@@ -66,6 +67,29 @@ class ReviewDesk:
         self._commit("review", {"reading": reading_id, "object": found.reading.object, **said, **final})
         told = {key: final.get(key) for key in FIELDS}
         return self._history.answer(reading_id, said=json.dumps(said), **told)
+
+    def to_teach(self, reading_id: int) -> tuple[StoredReading, bytes]:
+        """Return an answered reading with the picture (PNG) that shows its object and the plate around it.
+
+        Raises:
+            NoSuchTask: there is no such reading in the database.
+            NotPossibleNow: nobody has said what it shows, or no such picture is kept.
+        """
+        reading = self._history.row(reading_id).reading
+        if reading.answered is None or json.loads(reading.answered)["verdict"] == "unreadable":
+            raise NotPossibleNow(
+                f"nobody has said what reading {reading_id} shows, so it teaches nothing",
+                hint="answer it right or wrong first",
+                state="unanswered",
+            )
+        picture = None if reading.crop is None else self._history.crops.surroundings(reading.crop)
+        if picture is None:
+            raise NotPossibleNow(
+                f"no picture is kept of the plate around {reading.object}, from which its look could be taught",
+                hint="use `panelwright learn`, which takes an overview of the whole panel",
+                state="no-picture",
+            )
+        return reading, picture
 
     def _final(self, reading: StoredReading, verdict: Verdict, shows: dict[str, Any]) -> dict[str, Any]:
         """Return what the reading shows by an answer."""

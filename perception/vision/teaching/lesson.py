@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.vision.finding.blind import PLATE_M, Detection, candidate_places, chosen, lay_out, recognise
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, look_at
@@ -22,7 +22,8 @@ from perception.vision.finding.framing import one_plate
 from perception.vision.finding.match import distances
 from perception.vision.image import as_gray
 from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
-from perception.vision.projection import PanelProjection, homography
+from perception.vision.patch import CORNERS, rectify
+from perception.vision.projection import PanelProjection, PlateProjection, homography
 from perception.vision.teaching.sub_object import SubObject, outline_at
 
 SNAP_M = 0.004  # a click is moved to the middle of a sub-object that is so near
@@ -31,6 +32,9 @@ ABOUT_M = 0.012
 SAME_LOOK = 0.10  # a look that is so near to one already taught adds nothing
 ROBBED = 0.2  # a taught look that is so near to the new one could be classified as the new kind
 NOTHING_SIZE_M = (0.010, 0.010)
+SURROUNDINGS_M = (
+    0.15  # side of the square around an object that a look needs: its circles, and the plate between objects
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -144,6 +148,38 @@ def overview_of(
     gray = as_gray(image)
     view = view or one_plate(gray, plate_m, focal_px=focal_px).view
     return Overview(view=view, ground=lay_out(gray, view, plate_m), plate_m=plate_m)
+
+
+def surroundings(image: NDArray[Any], view: PanelProjection, point_m: ArrayLike, centre_px: ArrayLike) -> Image | None:
+    """Return the plate around an object, gray and upright, as seen from straight ahead, for `example_in`.
+
+    Args:
+        point_m: (3,) the object by the panel file.
+        centre_px: (2,) where the image shows it; nothing finite if that is not known.
+
+    Returns:
+        A square image of `SURROUNDINGS_M`; None if the image does not show all of it.
+    """
+    point, centre = np.asarray(point_m, float), np.asarray(centre_px, float)
+    foot_px, half_m = view.project([[*point[:2], 0.0]])[0], SURROUNDINGS_M / 2
+    shift_px = centre - foot_px if np.isfinite(centre).all() else np.zeros(2)
+    patch = rectify(as_gray(image), view, point[:2], half_width_m=half_m, half_height_m=half_m, shift_px=shift_px)
+    return patch.gray if patch.inside.all() else None
+
+
+def example_in(picture: Image) -> Example:
+    """Return the object in the middle of its `surroundings`.
+
+    Raises:
+        InvalidRequest, NotObservable: bad image.
+        NotFound: there is no object.
+    """
+    half_m, last_px = SURROUNDINGS_M / 2, np.array(picture.shape[1::-1], float) - 1.0
+    corners_m = CORNERS * half_m
+    corners_px = (CORNERS * [1.0, -1.0] + 1.0) / 2.0 * last_px
+    view = PlateProjection(px_from_plate=homography(corners_m, corners_px), corners_m=corners_m)
+    overview = overview_of(picture, plate_m=(SURROUNDINGS_M, SURROUNDINGS_M), view=view)
+    return example_at(overview, [(float(last_px[0] / 2.0), float(last_px[1] / 2.0))])
 
 
 def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, kind: str = "") -> Example:

@@ -9,6 +9,7 @@ from typing import Any
 from tests.service.browser import NEEDS_CHROMIUM
 from tests.service.console.served import Cell, leave_mission, until
 from tests.service.history.test_store import reading
+from tests.service.review.test_review import around
 from tests.service.waiting import eventually
 
 pytestmark = NEEDS_CHROMIUM
@@ -100,7 +101,9 @@ def test_the_cell_shows_the_planned_way_the_force_and_the_points_of_the_scanner(
 def test_readings_are_reviewed_by_keys_one_after_the_other(page: Any, cell: Cell) -> None:
     history = cell.service.service.plant.history
     asked = {"object": "setpoint", "kind": "slider", "unit": "%", "sigma": 2.0, "confidence": 0.4, "doubt": "it is dim"}
-    history.add([reading(k, 10.0 + k, utc_s=time.time() - 3600 + k, **asked) for k in range(20)])
+    crop = str(history.crops.add(b"\x89PNG a slider"))
+    history.crops.add_surroundings(crop, around("speed"))
+    history.add([reading(k, 10.0 + k, utc_s=time.time() - 3600 + k, crop=crop, **asked) for k in range(20)])
     page.goto(f"{cell.url}/review")
     page.fill("input[aria-label='Your name, for the record']", "alice")
     page.keyboard.press("Tab")
@@ -111,9 +114,11 @@ def test_readings_are_reviewed_by_keys_one_after_the_other(page: Any, cell: Cell
         until(page, f"document.querySelector('.main').textContent.includes('you have answered {k + 1}')")
     page.keyboard.press("u")
     until(page, "document.querySelector('.main').textContent.includes('you have answered 19')")
+    page.click(".q-toggle:has-text('Teach the look of the object, too')")
     page.fill("input[aria-label='Something else']", "33")
     page.keyboard.press("Enter")
     until(page, "document.querySelector('.main').textContent.includes('No reading waits.')")
+    until(page, "document.body.textContent.includes('The look was taught as slider.')")
     rows = history.reader().page(history.ask(object="setpoint"))
     said = [json.loads(row.reading.answered) for row in rows if row.reading.answered is not None]
     assert sorted(one["verdict"] for one in said) == ["right"] * 18 + ["unreadable", "wrong"]

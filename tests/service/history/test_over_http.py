@@ -151,6 +151,22 @@ def test_a_task_stores_everything_that_is_known_about_a_reading(tmp_path: Path) 
     assert (observer.asked_by, sorted(observer.newest())) == ("alice", ["gone", "pressure", "temperature"])
 
 
+def test_the_surroundings_of_doubted_readings_are_kept(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    kept = Observations(history=history, doubt_of=lambda one: "" if one.is_valid else "it was refused")
+    observer = kept.of_task(task="t1", verb="inspect", asked_by="", cell_now_s=lambda: 0.0)
+    names = ("pressure", "flow", "far")
+    crops = {name: name.encode() for name in names}
+    around = {"pressure": b"around pressure", "flow": b"around flow"}
+    observer.saw(
+        [seen("pressure", value=1.0), seen("flow", reason="glare"), seen("far", reason="x")], crops, around.get
+    )
+    sure, doubted, without = (str(row.reading.crop) for row in history.reader().page(history.ask()))
+    assert history.crops.surroundings(doubted) == b"around flow"
+    assert (history.crops.surroundings(sure), history.crops.surroundings(without)) == (None, None)
+    assert history.crops.surroundings("../../x") is None
+
+
 def test_a_reading_that_cannot_be_stored_is_not_passed_on(tmp_path: Path) -> None:
     history = history_in(tmp_path)
     kept = Observations(history=history)

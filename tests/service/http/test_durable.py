@@ -134,6 +134,7 @@ OTHERS = {
     "POST /v1/knowledge/outline", "POST /v1/read-photograph", "POST /v1/mission-files/check",  # they change nothing
     "PUT /v1/limits/{object}",  # as DELETE; the lamp of these tests has no limits that could be set
     "POST /v1/knowledge/teach",  # tests/service/http/test_knowledge.py
+    "POST /v1/review/{reading}/teach",  # tests/service/review/test_review.py
     *(f"POST /v1/{verb}" for verb in (*OPERATIONS, "judge")),  # tasks: tests/service/tasks/test_tasks.py
 }  # fmt: skip
 

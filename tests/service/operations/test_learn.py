@@ -11,6 +11,9 @@ import pytest
 from benchmarks.vision_simulated import judged, without_looks
 from hal.config import Cell, load_cell
 from hal.errors import NotFound
+from service.knowledge.store import KnowledgeStore
+from service.knowledge.teach import teach_surroundings
+from service.operations.inspect import ensure_located, inspect_here
 from service.operations.recognise import run_learn, run_recognise
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime
@@ -56,6 +59,18 @@ def test_one_overview_teaches_the_cell_its_panel(runtime: CellRuntime, tmp_path:
     now = blind(session(runtime, cell, tmp_path, memory), cell)
     assert len(before.missed) >= 4 and len(now.missed) <= 1
     assert all(answer.is_right for answer in now.answers)
+
+
+def test_a_doubted_reading_keeps_what_teaches_its_look(runtime: CellRuntime, tmp_path: Path) -> None:
+    cell, memory = without_looks(runtime.cell), WorldModel()
+    here = session(runtime, cell, tmp_path, memory)
+    ensure_located(here)
+    found = inspect_here(here, ["emergency"])
+    picture = found.surroundings(cell.panel.object("emergency"))
+    assert picture is not None
+    store = KnowledgeStore.of_runs(tmp_path / "runs", cell)
+    assert teach_surroundings(store, picture, kind="mushroom").added
+    assert "emergency" not in blind(here, cell).missed
 
 
 def test_the_shipped_cell_knows_its_panel_untaught(runtime: CellRuntime, tmp_path: Path) -> None:

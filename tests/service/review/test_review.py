@@ -15,14 +15,18 @@ from typer.testing import CliRunner
 from hal.errors import InvalidRequest
 from hal.panel import Panel
 from hal.strict import validate
+from perception.vision import CameraProjection
+from perception.vision.teaching import surroundings
 from service.cli import _app
 from service.errors import NotPossibleNow
 from service.history.parts import part_path, read_parts, write_parquet
 from service.history.reading import COLUMNS
 from service.history.store import ALL
+from service.report.plots import png_of
 from service.review.desk import ReviewDesk
 from service.review.doubts import Doubts
 from service.serve import Panelwright
+from tests.perception.vision.bench_panel import panel, scene
 from tests.service.history.test_store import NOW_S, history_in, reading
 
 GAUGE = {
@@ -132,6 +136,16 @@ def test_a_history_of_the_first_version_is_taken_over_with_its_parts(tmp_path: P
     assert read_parts([part], "value, doubt, final_value", "", []) == [(1.5, "", None)]
 
 
+def around(name: str) -> bytes:
+    """Return a picture of an object of the drawn bench and the plate around it, as the history keeps it."""
+    image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.62)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
+    point_m = panel().object(name).point_m
+    picture = surroundings(image, view, point_m, view.project([point_m])[0])
+    assert picture is not None
+    return png_of(picture)
+
+
 @pytest.fixture
 def waiting(served: Panelwright, client: httpx2.Client) -> Iterator[int]:
     """Yield the number of a reading that waits."""
@@ -163,3 +177,28 @@ def test_the_command_lists_pictures_and_answers(served: Panelwright, waiting: in
     assert (tmp_path / f"{waiting}-pump_lamp.png").read_bytes() == b"\x89PNG a lamp"
     told = run("answer", str(waiting), "wrong", "--state", "off", "--reason", "seen", "--by", "alice")
     assert told == f"reading {waiting} is answered: wrong\n"
+
+
+def test_an_answered_reading_teaches_its_look_over_http_and_on_the_command_line(
+    served: Panelwright, client: httpx2.Client, waiting: int
+) -> None:
+    history = served.service.plant.history
+    crop = str(history.row(waiting).reading.crop)
+
+    def teach() -> httpx2.Response:
+        return client.post(f"/v1/review/{waiting}/teach")
+
+    assert (teach().status_code, "nobody has said" in teach().json()["detail"]) == (409, True)
+    client.post(f"/v1/review/{waiting}", json={"by": "alice", "verdict": "right", "reason": "seen"})
+    assert (teach().status_code, "no picture is kept" in teach().json()["detail"]) == (409, True)
+    history.crops.add_surroundings(crop, around("emergency"))
+    taught = teach().json()
+    assert (taught["name"], taught["added"], Path(taught["path"]).name) == ("lamp", True, "lamp.toml")
+    told = CliRunner().invoke(_app(), ["review", "teach", str(waiting), "--url", served.url])
+    assert told.output == "this look of lamp is known already\n"
+    assert client.post("/v1/review/999999/teach").status_code == 404
+
+
+def test_an_answer_that_nobody_can_tell_teaches_nothing(client: httpx2.Client, waiting: int) -> None:
+    client.post(f"/v1/review/{waiting}", json={"by": "alice", "verdict": "unreadable", "reason": "blurred"})
+    assert client.post(f"/v1/review/{waiting}/teach").status_code == 409

@@ -15,6 +15,7 @@ from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.knowledge_files import load_knowledge, write_kind
 from perception.vision.projection import CameraProjection
 from perception.vision.teaching.from_panel import PanelLooks, teach_from_panel
+from perception.vision.teaching.lesson import example_in, surroundings, teach_example
 from tests.perception.vision.bench_panel import panel, scene
 
 PLATE_M = (0.60, 0.40)
@@ -55,6 +56,20 @@ def test_what_one_overview_taught_is_found_in_another(lesson: PanelLooks) -> Non
     assert "emergency" not in before and "emergency" in now
     assert len(now) >= len(panel().objects) - 1 and len(now) >= len(before)
     assert len(given) == len(now), "nothing is named that is not there"
+
+
+def test_an_object_is_found_after_its_surroundings_in_one_image_taught_it() -> None:
+    image, intrinsics, pose = scene(tilt_deg=4.0, distance_m=0.62)
+    view = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose)
+    button = panel().object("emergency")
+    picture = surroundings(image, view, button.point_m, view.project([button.point_m])[0])
+    assert picture is not None
+    taught = teach_example(example_in(picture), load_knowledge(), kind="mushroom")
+    assert (taught.is_new_kind, taught.added) == (True, True)
+    before, given_before = right(load_knowledge())
+    now, given = right(taught.knowledge)
+    assert now == before | {"emergency"} and len(given) == len(given_before) + 1, "no other name is new"
+    assert surroundings(image, view, [0.29, 0.19, 0.0], [np.nan, np.nan]) is None, "the image does not show all of it"
 
 
 def test_the_lesson_says_what_it_did(lesson: PanelLooks) -> None:

@@ -69,6 +69,41 @@ class _Push:
         return 1.0 if self.goal_m >= self.start_m else -1.0
 
 
+@dataclass(slots=True, kw_only=True)
+class _Witnesses:
+    """The look at a slider after a push, and what was felt of the push: together they tell whether it is at its target.
+
+    Attributes:
+        felt: of the newest push; None before it.
+        have_disagreed: whether a look contradicted the push before it.
+    """
+
+    scale: Scale
+    target: float
+    felt: Felt | None = None
+    have_disagreed: bool = False
+
+    @property
+    def _allowed(self) -> float:
+        return TOLERANCE_RATIO * (self.scale.maximum - self.scale.minimum)
+
+    def is_reached(self, seen: ObjectState) -> bool:
+        """Return whether one of the two is surely within the tolerance, and the other one agrees."""
+        is_too_unsure = SURE * seen.sigma > self._allowed  # it would contradict nothing
+        if self.felt is None or is_too_unsure or between_witnesses(self.scale, seen, self.felt):
+            return False
+        return any(surely_within(one.value, self.target, self._allowed, sigma=one.sigma) for one in (seen, self.felt))
+
+    def doubt(self, seen: ObjectState) -> str:
+        """Return why the slider may or may not be at its target; nothing if the look surely shows it elsewhere."""
+        doubtful = doubt_within(seen.value, self.target, self._allowed, sigma=seen.sigma)
+        if not doubtful and not surely_within(seen.value, self.target, self._allowed, sigma=seen.sigma):
+            return ""
+        between = between_witnesses(self.scale, seen, self.felt)
+        self.have_disagreed = self.have_disagreed or bool(between)
+        return between or doubtful
+
+
 def slider(
     context: SkillContext,
     fader: Slider,
@@ -99,32 +134,14 @@ def slider(
         )
     _check_provable(fader)
     where = InitialState(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
-    allowed = TOLERANCE_RATIO * (scale.maximum - scale.minimum)
-
-    pushed: list[Felt] = []
-    disagreed: list[str] = []
+    witnesses = _Witnesses(scale=scale, target=target)
 
     def stroke(attempt: Attempt) -> float:
-        pushed.clear()
+        witnesses.felt = None
         push = _Push(start_m=scale.place_of(where.known), goal_m=scale.place_of(target))
         value = scale.value_at(push.start_m + _push(attempt, fader, push))
-        pushed.append(Felt(value=value, sigma=float(np.hypot(where.sigma, PUSH_SIGMA_M / _metres_per_unit(scale)))))
+        witnesses.felt = Felt(value=value, sigma=float(np.hypot(where.sigma, PUSH_SIGMA_M / _metres_per_unit(scale))))
         return where.moved_to(value)
-
-    def is_reached(seen: ObjectState) -> bool:
-        felt = pushed[0] if pushed else None
-        is_too_unsure = SURE * seen.sigma > allowed  # it would contradict nothing
-        if felt is None or is_too_unsure or between_witnesses(scale, seen, felt):
-            return False
-        return any(surely_within(one.value, target, allowed, sigma=one.sigma) for one in (seen, felt))
-
-    def doubt(seen: ObjectState) -> str:
-        doubtful = doubt_within(seen.value, target, allowed, sigma=seen.sigma)
-        if not doubtful and not surely_within(seen.value, target, allowed, sigma=seen.sigma):
-            return ""
-        between = between_witnesses(scale, seen, pushed[0] if pushed else None)
-        disagreed.append(between)
-        return between or doubtful
 
     return perform(
         context,
@@ -132,11 +149,11 @@ def slider(
         skill="slider",
         object_name=name,
         target=f"{target:g} {scale.unit}".strip(),
-        is_reached=is_reached,
-        doubt=doubt,
+        is_reached=witnesses.is_reached,
+        doubt=witnesses.doubt,
         verify=where.verify,
         # A look that errs is followed by a push that errs as much, so that the two would agree the next time.
-        repeats=lambda: not any(disagreed),
+        repeats=lambda: not witnesses.have_disagreed,
     )
 
 

@@ -22,7 +22,7 @@ from service.sweep.table import report
 
 RETRIES = 1  # of a panel whose worker died
 LOCAL = "local"
-DIGITS = 7
+DIGITS = 9
 
 
 def sweep(
@@ -78,8 +78,8 @@ def _on_workers(
 def hash_of(run: PanelRun) -> str:
     """Return a hash of everything about a panel that a repetition must give again, that is, without the time on the wall.
 
-    Numbers count to `DIGITS` digits. The same processes repeat to the last bit; with the cell in the service's process
-    (`inline`) force, impulse and chatter differ in the 9th digit.
+    Numbers count to `DIGITS` digits. The same processes repeat to the last bit. With the cell in the service's process
+    (`inline`) force, impulse and chatter may differ in the 9th digit, so that its hash is another one.
     """
     plain = _rounded({**asdict(run), "wall_s": 0.0})
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]

@@ -12,7 +12,9 @@ from typing import Any
 
 import pytest
 
+from benchmarks.cell import clear_stop
 from hal.config import load_cell
+from service.client import Client
 from service.serve import Options, Panelwright
 from tests.docs.blocks import ROOT, Block, blocks, page_name
 
@@ -50,6 +52,7 @@ def test_the_blocks_of_a_page_run_one_after_the_other(
 ) -> None:
     if shutil.which("curl") is None:
         pytest.skip("curl is not installed")
+    clear_stop(Client(url=served.url))  # the pages share a service, and each begins with a cell that may move
     for name in LINKED:
         if (ROOT / name).exists():
             (tmp_path / name).symlink_to(ROOT / name)

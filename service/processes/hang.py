@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from hal.process_state import ThreadTimes, thread_times, threads_of
 
 STEP_S = 0.015  # looks that follow closer add nothing
-LONGEST_STEP_S = 0.04  # of a longer gap between two looks only this counts: the observer itself was kept waiting
+LONGEST_STEP_S = 0.03  # of a longer gap between two looks only this counts: the observer itself was kept waiting
 BUSY_SHARE = 0.5
 AGAIN_S = 0.0005  # a thread that only waits for the lock of Python wakes for a shorter time
 WAITED_S = 0.002  # a thread that waited longer for a processor since the last look shows that the machine is busy
@@ -91,7 +91,7 @@ class Hang:
         waits_s = [after.waited_s - first.waited_s for first, after in both]
         is_busy = max(computed_s, sum(waits_s)) > BUSY_SHARE * step_s or len(both) < len(now)
         is_waiting = any(times.state == WAITING for times in now.values())
-        is_still = not is_busy and not is_waiting and not self._could_run(pid, now)
+        is_still = not is_busy and not is_waiting and not self._could_run(pid, before, now)
         wakes = now[beating].turns - before[beating].turns if beating in now and beating in before else 0
         last = self._conduct
         self._conduct = Conduct(
@@ -101,11 +101,13 @@ class Hang:
             computed_s=last.computed_s + min(computed_s, step_s),
         )
 
-    def _could_run(self, pid: int, now: dict[int, ThreadTimes]) -> bool:
-        """Return whether a thread runs, or waits for a processor, both now and a moment later."""
+    def _could_run(self, pid: int, before: dict[int, ThreadTimes], now: dict[int, ThreadTimes]) -> bool:
+        """Return whether a thread waits for a processor since the last look, or runs or waits both now and a moment later."""
         runnable = [name for name, times in now.items() if times.state == RUNNABLE]
         if not runnable:
             return False
+        if any(name in before and now[name].turns == before[name].turns for name in runnable):
+            return True  # it has waited for its turn, and may have it in this moment
         threading.Event().wait(AGAIN_S)
         later = [self._thread(pid, name) for name in runnable]
         return any(times is not None and times.state == RUNNABLE for times in later)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from hal.process_state import ThreadTimes
+from service.processes.beat import STILL_S
 from service.processes.hang import LONGEST_STEP_S, Conduct, Hang
 
 STEP_S = 0.02
@@ -28,10 +29,13 @@ class Watched:
         )
         self.hang.look(7, BEATING)
 
-    def step(self, *, state: str = "S", computed_s: float = 0.0, waited_s: float = 0.0, gap_s: float = STEP_S) -> None:
+    def step(
+        self, *, state: str = "S", turns: int = 0, computed_s: float = 0.0, waited_s: float = 0.0, gap_s: float = STEP_S
+    ) -> None:
         self.working = replace(
             self.working,
             state=state,
+            turns=self.working.turns + turns,
             computed_s=self.working.computed_s + computed_s,
             waited_s=self.working.waited_s + waited_s,
         )
@@ -96,8 +100,21 @@ def test_all_threads_are_asleep_only_without_a_break(busy: dict[str, float | str
 def test_a_thread_that_wakes_at_the_moment_of_the_look_is_asked_again() -> None:
     watched = Watched()
     watched.a_moment_later = ASLEEP
-    watched.step(state="R")
+    watched.step(state="R", turns=1)
     assert watched.seen().still_s == pytest.approx(STEP_S)
+
+
+def test_a_thread_that_had_no_turn_since_the_last_look_waits_for_one_though_it_has_it_a_moment_later() -> None:
+    watched = Watched()
+    watched.a_moment_later = ASLEEP
+    watched.step(state="R")
+    assert watched.seen().still_s == 0.0
+
+
+def test_one_look_after_a_long_gap_shows_no_hang() -> None:
+    watched = Watched()
+    watched.step(gap_s=5.0)
+    assert watched.seen().still_s < STILL_S
 
 
 def test_an_observer_that_was_kept_waiting_itself_counts_little_of_the_gap() -> None:

@@ -25,9 +25,9 @@ from perception.vision import (
     viewpoints,
 )
 from perception.vision import inspect as inspect_image
-from service.operations.acquisition import Look, base_from, look, settle
+from service.operations.acquisition import Look, Scan, base_from, look, settle
 from service.operations.locate import go_to_overview, locate_from_overview, offset_m
-from service.operations.range_detection import read_by_height
+from service.operations.range_detection import read_by_height, scan_beside
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
@@ -60,11 +60,13 @@ class AnnotatedView:
 class Inspection:
     """The readings from one or several images, with one picture per image.
 
-    `offset_m` is how far the last image shows the panel from its estimated pose; see `offset_m`.
+    `offset_m` is how far the last image shows the panel from its estimated pose; see `offset_m`. `scans` are range images
+    that were taken from the same poses.
     """
 
     readings: dict[str, ObjectReading]
     pictures: tuple[AnnotatedView, ...]
+    scans: tuple[Scan, ...] = ()
     offset_m: float = 0.0
 
     def crops(self) -> dict[str, bytes]:
@@ -144,12 +146,14 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     groups = [groups[k] for k in visiting_order(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
     readings: dict[str, ObjectReading] = {}
     pictures: list[AnnotatedView] = []
+    scans: list[Scan] = []
     for k, (centre_m, group) in enumerate(groups):
         session.progress(k / len(groups), "close-up", ", ".join(group))
         closer = look_close(session, centre_m, group, distance_m=distance_m)
         readings |= closer.readings
         pictures += closer.pictures
-    return Inspection(readings=readings, pictures=tuple(pictures))
+        scans += scan_beside(session)
+    return Inspection(readings=readings, pictures=tuple(pictures), scans=tuple(scans))
 
 
 def _camera_over_panel(session: Session) -> Array:
@@ -184,7 +188,7 @@ def look_past(session: Session, found: Inspection) -> Inspection:
     if len(unread) > MOST_UNREAD:
         return found
     looks = {reading.name: [reading] for reading in unread}
-    by_height = read_by_height(session, [reading for reading in unread if reading.needs_closer_sides])
+    by_height = read_by_height(session, [one for one in unread if one.needs_closer_sides], found.scans)
     alike = [reading.name for reading in unread if reading.needs_closer_sides and reading.name not in by_height]
     hidden = [reading.name for reading in unread if not reading.needs_closer_sides]
     pictures = list(found.pictures)
@@ -202,7 +206,7 @@ def look_past(session: Session, found: Inspection) -> Inspection:
         session.world.forget_reading(name)  # a single image may have given a reading that the others contradict
     readings = found.readings | told
     session.world.note_readings(readings.values())
-    return Inspection(readings=readings, pictures=tuple(pictures))
+    return replace(found, readings=readings, pictures=tuple(pictures))
 
 
 def _from_the_sides(

@@ -81,7 +81,7 @@ def scan_plate(session: Session) -> ScannedPlane:
 
 
 def plate_in(session: Session, image: Scan) -> ScannedPlane:
-    """Fit the plane of the plate to a range image that was taken from the present pose of the arm.
+    """Fit the plane of the plate to a range image.
 
     Raises:
         NotFound: there is no plane near the estimated pose of the panel, or the image is not a pinhole projection.
@@ -94,6 +94,7 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
             f"{image.scanner} has {c.projection} projection; the plate is fitted to pinhole range images",
             hint="use a range camera, or a line scanner, which is swept with the wrist",
         )
+    mount = session.mount(image.scanner)
     pose = scanner_from_panel.parent_from_child
     sigma = np.sqrt(np.diag(scanner_from_panel.covariance))
     fit = fit_plane_near(
@@ -103,12 +104,11 @@ def plate_in(session: Session, image: Scan) -> ScannedPlane:
         normal=pose.rotation.apply([0.0, 0.0, 1.0]),
         sigma_offset_m=float(max(sigma[:3].max(), 0.005)),
         sigma_angle_rad=float(max(sigma[3:].max(), 0.01)),
-        swept=image.swept_errors(session.mount(image.scanner)),
+        swept=image.swept_errors(mount),
     )
-    flange = session.mover.state().base_from_flange
     observation = PlaneObservation(
         sensor=image.scanner,
-        base_from_flange=flange,
+        base_from_flange=image.base_from_scanner.parent_from_child * mount.parent_from_child.inv(),
         point_m=fit.feature.point_m,
         normal=fit.feature.direction,
         point_covariance=fit.feature.point_covariance,

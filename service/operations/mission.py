@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from fusion import Observation, PoseTolerance, error_budget
 from hal.devices import DeviceKind
-from hal.errors import CellError, DeviceError, InvalidRequest, PerceptionError, Unreachable
+from hal.errors import CellError, DeviceError, InvalidRequest, NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from perception.vision import PanelWay
 from service.errors import Defect
@@ -22,7 +22,7 @@ from service.missions.conditions import Seen
 from service.missions.files import mission_of
 from service.missions.interpreter import Interpreter, leaves_of
 from service.missions.progress import FILE, Progress, load_progress
-from service.operations.acquisition import Look, settle
+from service.operations.acquisition import Look, Scan, settle
 from service.operations.find_panel import Located, locate, panel_observations, ways_of
 from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result, tell
 from service.operations.locate import (
@@ -31,12 +31,21 @@ from service.operations.locate import (
     go_to_overview,
     locate_from_overview,
     object_depths,
+    plate_in,
     rim_observations,
     rims_in,
     scan_plate,
 )
 from service.operations.manipulate import other_than_shown, refused_action, usual_actions, work
-from service.operations.range_detection import OVERVIEW, SurfaceView, check_surfaces, need_its_place, view_surfaces
+from service.operations.range_detection import (
+    FACING,
+    OVERVIEW,
+    SurfaceView,
+    check_surfaces,
+    ensure_space_is_known,
+    need_its_place,
+    view_surfaces,
+)
 from service.operations.sense import feel, fuse_and_remember, fused_result, mounts_of
 from service.operations.session import OperationContext, Session, panel_object_or_all
 from service.operations.travel import leave_the_panel, park, plan_mission
@@ -151,6 +160,8 @@ def _run(worker: _Worker, interpreter: Interpreter) -> None:
         need_all_present(overview, session)
         record.objects = _places(session, overview)
         worker.looks += [view.look for view in overview.pictures]
+        is_touching = any(isinstance(step, SetStep | FeelStep) for step in interpreter.progress.all_steps())
+        worker.surfaces = _surfaces(part, worker.found.plane, is_touching=is_touching)
     interpreter.run()
     if record.depths is None:
         _note_depths(session, record, rims_in(session, worker.looks))
@@ -166,7 +177,9 @@ class _Worker:
     Attributes:
         leaves: number of steps without steps of their own, by which the progress is shared out.
         found: the panel as it was located.
+        surfaces: the objects with a relief in a range image; None without a range scanner.
         looks: images in which objects were read, whose rims are fused into the pose.
+        scans: range images from the poses of those looks.
         checks: comparison of the objects with their surfaces.
     """
 
@@ -174,7 +187,9 @@ class _Worker:
     record: MissionRecord
     leaves: int
     found: _Found = field(init=False)
+    surfaces: SurfaceView | None = None
     looks: list[Look] = field(default_factory=list)
+    scans: list[Scan] = field(default_factory=list)
     checks: list[SurfaceCheck] = field(default_factory=list)
     _begun: int = 0
     _inspections: int = 0
@@ -219,11 +234,11 @@ class _Worker:
 
     def _check_surfaces(self, low: float, high: float) -> None:
         """Compare the objects with their surfaces, once."""
-        if self.found.surfaces is None or self.record.by_surfaces is not None:
+        if self.surfaces is None or self.record.by_surfaces is not None:
             return
         with _step(self.session, "check by surfaces", low, high) as part:
             part.progress(0.0, "compare mushrooms and handwheels with panel file and vision")
-            self.checks, pictures = check_surfaces(part, self.found.surfaces)
+            self.checks, pictures = check_surfaces(part, self.surfaces, self.scans)
             self.record.by_surfaces = self.checks
             self.record.pictures += pictures
 
@@ -269,6 +284,7 @@ class _Worker:
         _note_pictures(self.record, read, name)
         self.record.readings += [reading_result(reading, phase) for reading in read.readings.values()]
         self.looks += [view.look for view in read.pictures]
+        self.scans += read.scans
 
     def _span(self, low: float, high: float) -> tuple[float, float]:
         """Return a part of the progress of the present step, as a range of the mission's."""
@@ -279,11 +295,10 @@ class _Worker:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:
-    """The panel from one or two views, and with a range scanner its plate and the objects with a relief."""
+    """The panel from one or two views, and with a range scanner its plate."""
 
     views: tuple[Located, ...]
     plane: ScannedPlane | None = None
-    surfaces: SurfaceView | None = None
 
     @property
     def observations(self) -> tuple[Observation, ...]:
@@ -305,7 +320,7 @@ def _find(session: Session, record: MissionRecord, tolerance: PoseTolerance) -> 
             part.progress(0.0, "scan the plate")
             plane = scan_plate(part)
             _note_plane(record, plane)
-            found = replace(found, plane=plane, surfaces=view_surfaces(part, plane, OVERVIEW))
+            found = replace(found, plane=plane)
     if _pose_error(session, found.observations, tolerance) > 1.0:
         with _step(session, "square view", 0.13, 0.19) as part:
             part.progress(0.0, "drive to the square view")
@@ -313,6 +328,15 @@ def _find(session: Session, record: MissionRecord, tolerance: PoseTolerance) -> 
             found = replace(found, views=(*found.views, locate(part)))
     _note_found(record, found.views[-1])
     return found
+
+
+def _surfaces(session: Session, overview: ScannedPlane | None, *, is_touching: bool) -> SurfaceView | None:
+    """Find the objects with a relief in a range image of the whole panel, or else in that of the overview."""
+    image = ensure_space_is_known(session) if is_touching else None  # from the overview it is a short way
+    if image is not None:
+        with suppress(NotFound):
+            return view_surfaces(session, plate_in(session, image), FACING)
+    return None if overview is None else view_surfaces(session, overview, OVERVIEW)
 
 
 def _pose_error(session: Session, known: Sequence[Observation], tolerance: PoseTolerance) -> float:

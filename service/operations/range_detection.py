@@ -8,7 +8,9 @@ before the panel, such as a cable, is noted for the paths of the arm.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +40,7 @@ from perception.range import (
 )
 from perception.vision import ObjectReading, viewpoints
 from service.operations.acquisition import Scan, device_of_kind, has_range_camera, scan, settle
-from service.operations.locate import ScannedPlane, scan_plate
+from service.operations.locate import ScannedPlane, plate_in, scan_plate
 from service.operations.session import Session
 from service.operations.travel import go_to_first, skill_context
 from service.report.plots import png_of
@@ -46,10 +48,12 @@ from service.report.record import Picture
 from service.report.surfaces import Mark, surfaces_picture
 from service.schema.mission_results import SurfaceCheck
 
-OVERVIEW, CLOSER = "the overview", "a closer look"
+OVERVIEW, FACING, CLOSER = "the overview", "before the panel", "a closer look"
 VIEW_SLACK_M = 0.0  # around the panel, in a view of all of it
 FLOOR_SLACK_M, HAND_M = 0.03, 0.05  # what is so near to the floor or the finger tips is the floor or the hand
+TURN_ARM_M = 0.3  # a turn of the scanner counts as the way of a point at this distance
 EDGE_PX = 2
+FOOTPRINT_RATIO = 1.4  # of an object with the plate around it to its footprint
 ARM_SLACK_M = 0.03  # what is so near to the model of the arm is the arm, which a folded arm's scanner sees
 SURE_ODDS = 6.0  # least logarithm of the odds of a state that a height proves
 
@@ -108,8 +112,13 @@ def view_surfaces(session: Session, plane: ScannedPlane, place: str) -> SurfaceV
     return SurfaceView(place=place, scan=plane.scan, scene=scene, sightings=tuple(found))
 
 
-def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCheck], list[Picture]]:
-    """Compare the objects seen from the overview; scan those again that disagree or were not found.
+def check_surfaces(
+    session: Session, first: SurfaceView, near: Sequence[Scan] = ()
+) -> tuple[list[SurfaceCheck], list[Picture]]:
+    """Compare the objects of a scan of the whole panel, and those that disagree or were not found in a nearer one.
+
+    Args:
+        near: range images that were taken before; the scanner is driven to an object that none of them shows.
 
     Raises:
         NotFound: the panel has not been located.
@@ -122,7 +131,7 @@ def check_surfaces(session: Session, first: SurfaceView) -> tuple[list[SurfaceCh
         name = sighting.panel_object.name
         check = compared(sighting, base_from_panel, session.panel.tolerances.position_m, shown.get(name), first.place)
         if not check.agrees:
-            again = _look_closer(session, sighting.panel_object)
+            again = _nearer_view(session, near, sighting.panel_object) or _look_closer(session, sighting.panel_object)
             if isinstance(again, SurfaceView):
                 pictures.append(_picture(session, again, f"surfaces-{name}"))
                 (second,) = [s for s in again.sightings if s.panel_object.name == name]
@@ -214,6 +223,28 @@ def _shows_alike(sighting: Sighting, reading: ObjectReading | None) -> bool:
     return states_agree(sighting, state=reading.state, value=reading.value, sigma=reading.uncertainty)
 
 
+def _nearer_view(session: Session, near: Iterable[Scan], panel_object: PanelObject) -> SurfaceView | None:
+    """Return the surfaces of the first range image that shows all of the object; None if none does."""
+    for image in near:
+        if _shows_all(image, session.known_panel().parent_from_child, panel_object):
+            with suppress(NotFound):
+                return view_surfaces(session, plate_in(session, image), CLOSER)
+    return None
+
+
+def _shows_all(image: Scan, base_from_panel: RigidTransform, panel_object: PanelObject) -> bool:
+    """Return whether the footprint of the object, and the plate around it, lies within the image."""
+    x, y, z = panel_object.point_m
+    half_x, half_y = FOOTPRINT_RATIO * np.array(panel_object.half_footprint_m)
+    corners = [(x + a, y + b, z) for a in (-half_x, half_x) for b in (-half_y, half_y)]
+    c, scanner_from_base = image.capabilities, image.base_from_scanner.parent_from_child.inv()
+    in_scanner = scanner_from_base.apply(base_from_panel.apply(corners))
+    if in_scanner[:, 2].min() < c.min_range_m:
+        return False
+    u, v = np.array([c.cx, c.cy])[:, None] + np.array([c.fx, c.fy])[:, None] * (in_scanner[:, :2] / in_scanner[:, 2:]).T
+    return bool(min(u.min(), v.min()) >= 0.0 and u.max() <= c.width - 1.0 and v.max() <= c.height - 1.0)
+
+
 def _look_closer(session: Session, panel_object: PanelObject) -> SurfaceView | str:
     """Scan the object from a pose perpendicular to it; returns the reason as text when that is not possible."""
     try:
@@ -241,8 +272,10 @@ def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
     return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))
 
 
-def ensure_space_is_known(session: Session) -> None:
+def ensure_space_is_known(session: Session) -> Scan | None:
     """Look with the range camera for what stands before the panel, unless that was done since it was located.
+
+    Returns the range image, which shows the whole panel; None if there is none.
 
     A line scanner is not swept for it. Where the camera does not get to see the whole panel, or fails, that is told as
     progress, and the paths are planned among what the panel file describes.
@@ -252,7 +285,7 @@ def ensure_space_is_known(session: Session) -> None:
         Stopped, MotionError, Cancelled: the cell cannot go on.
     """
     if session.world.obstacles is not None or not has_range_camera(session):
-        return
+        return None
     session.world.note_obstacles(())
     session.progress(0.0, "look for what stands before the panel")
     try:
@@ -261,11 +294,23 @@ def ensure_space_is_known(session: Session) -> None:
             session.known_panel().parent_from_child, session.panel, _as_lens(device.capabilities()), VIEW_SLACK_M
         )
         back = session.mount(name).parent_from_child.inv()
-        go_to_first(session, (view * back for view in views), name="face the panel with the scanner", thorough=False)
+        context = skill_context(session)
+        here = context.kinematics.flange(session.mover.state().position_rad)
+        near = sorted((view * back for view in views), key=lambda flange: _way_m(here, flange))
+        go_to_first(session, near, name="face the panel with the scanner", thorough=False)
         settle(session)
-        session.world.note_obstacles(obstacles_in(session, scan(session)))
+        image = scan(session)
+        session.world.note_obstacles(obstacles_in(session, image))
     except (DeviceError, PerceptionError, Unreachable, Unsupported) as error:
         session.progress(1.0, "what stands before the panel is not known", error.what)
+        return None
+    return image
+
+
+def _way_m(one: RigidTransform, other: RigidTransform) -> float:
+    """Return how far the flange moves between two poses, with a turn counted as the way of a point at `TURN_ARM_M`."""
+    step = one.inv() * other
+    return float(np.linalg.norm(step.translation) + TURN_ARM_M * step.rotation.magnitude())
 
 
 def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
@@ -308,34 +353,57 @@ def _as_lens(c: RangeScannerCapabilities) -> CameraIntrinsics:
     return CameraIntrinsics(fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy, width_px=c.width, height_px=c.height)
 
 
-def read_by_height(session: Session, readings: Sequence[ObjectReading]) -> dict[str, ObjectReading]:
+def scan_beside(session: Session) -> tuple[Scan, ...]:
+    """Return a range image from the pose of a camera's look; empty without a range camera, or when it fails.
+
+    It shows a part of the panel beside that in the look, from near, so that fewer ways to such views are needed.
+    """
+    if not has_range_camera(session):
+        return ()
+    try:
+        return (scan(session),)
+    except DeviceError as error:
+        session.progress(1.0, "look", f"no range image: {error.what}")
+        return ()
+
+
+def read_by_height(
+    session: Session, readings: Sequence[ObjectReading], near: Iterable[Scan] = ()
+) -> dict[str, ObjectReading]:
     """Return new readings of those caps whose height in a range image proves their state.
 
     A line scanner is not swept for it, because looks from the sides take less time. The same holds for a scanner that
     fails: the failure is told as progress, and the caps are looked at from the sides.
+
+    Args:
+        near: range images that were taken before; the scanner is driven to caps whose height none of them proves.
     """
     unread = {reading.name: reading for reading in readings if session.panel.object(reading.name).cap is not None}
     if not unread or not has_range_camera(session):
         return {}
     proved: dict[str, ObjectReading] = {}
+
+    def left() -> list[PanelObject]:
+        return [session.panel.object(name) for name in unread if name not in proved]
+
     try:
-        for image, objects in _scans(session, [session.panel.object(name) for name in unread]):
-            for panel_object in objects:
-                odds = _released_log_odds(session, image, panel_object)
+        for image, caps in itertools.chain(((image, left()) for image in near), _scans(session, left)):
+            for cap in caps:
+                odds = _released_log_odds(session, image, cap)
                 if odds is not None and abs(odds) >= SURE_ODDS:
-                    proved[panel_object.name] = _reading(unread[panel_object.name], odds)
+                    proved[cap.name] = _reading(unread[cap.name], odds)
     except (DeviceError, PerceptionError, Unreachable) as error:
         session.progress(1.0, "look past what hides it", f"no range image of {', '.join(unread)}: {error.what}")
     return proved
 
 
-def _scans(session: Session, caps: Sequence[PanelObject]) -> Iterator[tuple[Scan, tuple[PanelObject, ...]]]:
-    """Yield range images from close-ups that together show all caps, and the caps in each."""
-    for (x, y, z), names in viewpoints.close_up_groups(caps, session.lens()):
+def _scans(session: Session, left: Callable[[], list[PanelObject]]) -> Iterator[tuple[Scan, Sequence[PanelObject]]]:
+    """Yield range images from close-ups that together show all caps that are left at the first, and the caps in each."""
+    for (x, y, z), names in viewpoints.close_up_groups(left(), session.lens()):
         title = f"heights of {', '.join(names)}"
         session.progress(1.0, "look past what hides it", title)
         _face(session, (x, y, z), name=title)
-        yield scan(session), tuple(session.panel.object(name) for name in names)
+        yield scan(session), [session.panel.object(name) for name in names]
 
 
 def _released_log_odds(session: Session, image: Scan, panel_object: PanelObject) -> float | None:

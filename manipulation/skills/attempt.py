@@ -28,7 +28,8 @@ from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 APPROACH_M_PER_S = 0.06
 CONTACT_N = 8.0
 STANDOFF_M = 0.020  # distance of the tips from the object's highest point
-RETREAT_M = 0.050
+LEAVE_M = 0.030  # of the tips after a stroke: 10 mm beyond the standoff, to which the arm could move before
+RETREAT_M = 0.050  # the same after an error
 RETREAT_M_PER_S = 0.15
 PADS_M_PER_S = 0.1
 LET_GO_N = 15.0
@@ -171,7 +172,7 @@ class Attempt:
         goal = shifted(self.pose(), (0.0, 0.0, distance_m))
         return self.straight(goal, name=name, speed_m_per_s=speed_m_per_s, guards=(guard,))
 
-    def leave(self, distance_m: float = RETREAT_M) -> None:
+    def leave(self, distance_m: float = LEAVE_M) -> None:
         """Move back along the fingers.
 
         Raises:

@@ -28,6 +28,7 @@ SOFT_PUSH = Compliance(
     max_offset_m=0.015,
 )
 RELAX_S = 0.5
+FREE_N, FREE_NM = 1.5, 0.1  # of a hand on which nothing presses
 RELAXING = Compliance(
     stiffness=(50.0, 50.0, 400.0, INF, INF, 0.5),
     damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 2.0),
@@ -105,6 +106,9 @@ def meet(
 
 def relax(attempt: Attempt) -> None:
     """Stay and yield, also about the fingers, until nothing presses on the hand: what presses rubs when it leaves."""
+    felt = attempt.reports[-1].wrench
+    if np.linalg.norm(felt[:3]) < FREE_N and np.linalg.norm(felt[3:]) < FREE_NM:
+        return
     here = attempt.pose()
     attempt.run(
         CartesianPath(

@@ -205,7 +205,7 @@ def _turn_once(
     try:
         match hold:
             case Hold.ACROSS:
-                turn, part_rad = hold_across(attempt, wheel, angle_rad, span_rad, belief)
+                turn, part_rad = hold_across(attempt, wheel, angle_rad, span_rad)
             case Hold.SPOKES:
                 enough_m = SPARE_PUSH * belief.effort_nm / (2.0 * PUSH_N)
                 holds = spoke_holds(wheel, attempt.context.hand, angle_rad, sign, least_arm_m=enough_m)

@@ -19,11 +19,11 @@ LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have tur
 SLACK_RAD = 0.03
 LEARNT_SHARE = 0.5  # pads that have slipped a little lose nothing in the next hold
 MOST_LOST_RAD = 0.15  # what pads, fingers and arm yield under the torque of a heavy wheel
-POOR_FRICTION = 0.3  # of pads on paint, with which the first grip across a wheel reckons
-SPARE_GRIP = 1.3
 FRICTION = 0.5  # of the pads on paint; where they slip, the spoke takes over
 ACROSS_SIDE_M, LEAST_ACROSS_M = 0.006, 0.0005  # wanted and least free space on each side of a hand across the wheel
-GRIP_ACROSS_N = (20.0, 90.0)  # the force of one pad is taken by the other, so neither arm nor shaft feel it
+# The force of one pad is taken by the other, so neither arm nor shaft feel it. With less, for a stated effort, pads slipped by
+# up to 0.2 rad, which no finger felt.
+GRIP_ACROSS_N = 90.0
 
 
 class Hold(StrEnum):
@@ -41,7 +41,6 @@ class Belief:
     Attributes:
         effort_nm: torque that moves the wheel, or the largest that did not.
         failed: holds that were tried in vain.
-        grip_n: force of the pads across the wheel; None until the first such hold.
         tried_nm: largest torque that was put on the wheel.
         has_slipped: whether the pads slipped in a hold, so that the torque at which the wheel gives way is not known.
         lost_rad: by how much less the wheel turns in a hold than is felt, because it springs back when it is let go.
@@ -49,7 +48,6 @@ class Belief:
 
     effort_nm: float
     failed: set[Hold] = field(default_factory=set)
-    grip_n: float | None = None
     tried_nm: float = 0.0
     has_slipped: bool = False
     lost_rad: float = 0.0
@@ -61,12 +59,6 @@ class Belief:
         takes = {hold: nm for hold, nm in torques_nm(wheel, hand).items() if hold not in self.failed}
         enough = [hold for hold, nm in takes.items() if nm > self.effort_nm]
         return enough[0] if enough else max(takes, key=lambda hold: takes[hold], default=None)
-
-    def grip_across_n(self, wheel: Handwheel) -> float:
-        """Return the force of the pads across the wheel: for the believed effort, and the largest after a slip."""
-        wanted_n = SPARE_GRIP * self.effort_nm / (2.0 * POOR_FRICTION * outer_m(wheel))
-        self.grip_n = float(np.clip(max(wanted_n, self.grip_n or 0.0), *GRIP_ACROSS_N))
-        return self.grip_n
 
     def begin(self, seen_rad: float) -> None:
         """Note where the wheel stood before the first hold."""
@@ -88,7 +80,7 @@ class Belief:
     def learn(self, seen_rad: float) -> float:
         """Compare what the last hold felt with what is seen; returns the turn that is missing, 0 if it is small.
 
-        A hold that slipped has failed; across the wheel only with the largest force of the pads.
+        A hold that slipped has failed.
         """
         if self._last is None:
             return 0.0
@@ -102,19 +94,16 @@ class Belief:
         return felt_rad - moved_rad
 
     def slipped(self, hold: Hold) -> None:
-        """Note that the pads slipped."""
+        """Note that the pads slipped in a hold, which has failed then."""
         self.has_slipped = True
-        if hold is Hold.ACROSS and (self.grip_n or 0.0) < 0.9 * GRIP_ACROSS_N[1]:
-            self.grip_n = GRIP_ACROSS_N[1]
-        else:
-            self.failed.add(hold)
+        self.failed.add(hold)
 
 
 def torques_nm(wheel: Handwheel, hand: Hand) -> dict[Hold, float]:
     """Return the torque that each possible hold of a wheel takes, the best hold first."""
     takes: dict[Hold, float] = {}
     if across_gap_m(wheel, hand) >= LEAST_ACROSS_M:
-        takes[Hold.ACROSS] = 2.0 * FRICTION * GRIP_ACROSS_N[1] * outer_m(wheel)
+        takes[Hold.ACROSS] = 2.0 * FRICTION * GRIP_ACROSS_N * outer_m(wheel)
     if holds := spoke_holds(wheel, hand, 0.0, 1.0):
         takes[Hold.SPOKES] = 2.0 * PUSH_N * holds[0].arm_m
     takes[Hold.RIM] = SIDE_N * wheel.radius_m

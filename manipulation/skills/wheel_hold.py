@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.errors import Unreachable
-from hal.motion import CartesianPath, Compliance
+from hal.motion import CartesianPath, Compliance, Guard, Quantity
 from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
 from manipulation.skills.attempt import STANDOFF_M, Attempt
@@ -18,7 +18,7 @@ from manipulation.skills.context import panel_from_grip
 from manipulation.skills.crank import SpokeHold
 from manipulation.skills.landing import come_down
 from manipulation.skills.outcome import Outcome, SkillFailure
-from manipulation.skills.wheel_belief import FRICTION, PUSH_N, SIDE_N, SPARE_M, Belief, across_gap_m, outer_m
+from manipulation.skills.wheel_belief import FRICTION, GRIP_ACROSS_N, PUSH_N, SIDE_N, SPARE_M, across_gap_m, outer_m
 from manipulation.skills.wheel_turn import HEAVY_M_PER_S, HEAVY_N, LAG_RAD, TURN_M_PER_S, WheelTurn
 
 TIP_DEPTH_M = 0.014  # depth of the tips below the middle of the spokes
@@ -37,6 +37,7 @@ SPOKE_GAP_M = 0.0025  # between the inner finger and the spoke beside which it h
 GRIP_N = (12.0, 25.0)  # smallest and largest force of the pads; with 45 N friction along the fingers reached 70 N
 LIGHT_N, SETTLE_S, SETTLES = 8.0, 0.25, 6
 GRIP_STEP_N = 20.0
+QUIET = Guard(name="quiet", quantity=Quantity.FORCE, limit=1.5, below=True, ticks=12)
 EVEN_N = 3.0  # a larger side force shows that only one of the pads is at the rim
 # Pads that press lightly centre the hand on the rim before they press firmly: both pads move by one screw, so a rim that is
 # off their middle by 2 mm would push the arm aside with all of the grip force. Along the fingers the friction of the pads
@@ -48,9 +49,7 @@ SIDEWAYS = Compliance(
 )  # fmt: skip
 
 
-def hold_across(
-    attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float, belief: Belief
-) -> tuple[WheelTurn, float]:
+def hold_across(attempt: Attempt, wheel: Handwheel, angle_rad: float, span_rad: float) -> tuple[WheelTurn, float]:
     """Hold the whole wheel between the fingers, which nothing but their friction turns; any angle of the hand will do."""
     hand, sign = attempt.context.hand, float(np.sign(span_rad))
     low, top = wheel.height_m - wheel.rim_m - RIM_DEPTH_M, wheel.height_m + STANDOFF_M
@@ -65,7 +64,7 @@ def hold_across(
     width = 2.0 * (outer_m(wheel) + across_gap_m(wheel, hand))
     _, part = _begin(attempt, wheel, span_rad, HOLDS_RAD, width, ways)
     come_down(attempt, STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, what="the wheel")
-    _squeeze(attempt, belief.grip_across_n(wheel), least_m=1.6 * wheel.radius_m, what="wheel")
+    _squeeze(attempt, GRIP_ACROSS_N, least_m=1.6 * wheel.radius_m, what="wheel")
     turn = WheelTurn(
         attempt=attempt, wheel=wheel, sign=sign, behind_rad=0.0, most_nm=2.0 * PUSH_N * outer_m(wheel),
         up_m=STANDOFF_M + wheel.rim_m + RIM_DEPTH_M, open_m=width, is_across=True,
@@ -160,12 +159,12 @@ def _squeeze(attempt: Attempt, grip_n: float, *, least_m: float, what: str) -> N
 
 
 def _settle(attempt: Attempt) -> None:
-    """Stay, and yield to what pushes the hand along the closing direction of its pads."""
+    """Stay until nothing pushes on the hand any more, and yield along the closing direction of its pads."""
     here = attempt.pose()
     attempt.run(
         CartesianPath(
             name="settle on the rim", flange_from_tool=attempt.context.flange_from_grip,
-            times_s=np.array([0.0, SETTLE_S]), base_from_tool=(here, here), compliance=SIDEWAYS,
+            times_s=np.array([0.0, SETTLE_S]), base_from_tool=(here, here), compliance=SIDEWAYS, guards=(QUIET,),
         )
     )  # fmt: skip
 

@@ -16,7 +16,7 @@ from manipulation.skills.contact import relax
 from manipulation.skills.outcome import Outcome, SkillFailure
 from manipulation.skills.turning import Felt, felt_in
 
-TURN_M_PER_S = 0.08
+TURN_M_PER_S = 0.12
 HEAVY_N, HEAVY_M_PER_S = 50.0, 0.03  # a larger side force is expected: the force overshoots less
 LAG_RAD = 0.8  # largest turn by which the hand is ahead of the wheel, because the pads yield
 FIRST_RAD = 0.3  # first part of a turn; it shows at which torque the wheel gives way

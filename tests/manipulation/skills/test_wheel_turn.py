@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.motion import CartesianPath
 from hal.panel import Handwheel
 from manipulation.skills.attempt import Attempt
+from manipulation.skills.contact import relax
 from manipulation.skills.turning import Felt
 from manipulation.skills.wheel_turn import FREEING_N, WheelTurn
 
@@ -19,6 +20,7 @@ HUB_M = np.array([0.4, 0.1, 0.0])
 TIPS = RigidTransform.from_components([0.4, 0.11, 0.02], Rotation.from_euler("x", np.pi))
 WHEEL = SimpleNamespace(position_m=(0.4, 0.1))
 UP_M = 0.05
+PRESSED_N = 20.0
 
 
 class Hand:
@@ -27,6 +29,7 @@ class Hand:
     def __init__(self) -> None:
         self.here, self.asked = TIPS, list[CartesianPath]()
         self.left_m: list[float] = []
+        self.reports = [SimpleNamespace(wrench=np.array([0.0, PRESSED_N, 0.0, 0.0, 0.0, 0.0]))]
         identity = RigidTransform.identity()
         self.context = SimpleNamespace(panel_pose=identity, flange_from_grip=identity)
 
@@ -80,3 +83,13 @@ def test_a_hand_that_slipped_or_held_the_rim_leaves_where_it_is(felt: Felt, open
     hand = let_go(1.0, 0.8, 1.0, felt=felt, open_m=open_m)
     assert [motion.name for motion in hand.asked] == ["relax"]
     assert hand.left_m == [UP_M]
+
+
+@pytest.mark.parametrize(
+    ("wrench", "relaxes"), [([0.5, 0.5, 0.5, 0, 0, 0.05], 0), ([0, 0, 2.0, 0, 0, 0], 1), ([0] * 5 + [0.2], 1)]
+)
+def test_a_hand_on_which_nothing_presses_need_not_relax(wrench: list[float], relaxes: int) -> None:
+    hand = Hand()
+    hand.reports = [SimpleNamespace(wrench=np.array(wrench))]
+    relax(cast(Attempt, hand))
+    assert len(hand.asked) == relaxes

@@ -10,7 +10,7 @@ from hal.errors import InvalidRequest, Unreachable
 from hal.panel import Handwheel
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.context import SkillContext
-from manipulation.skills.crank import spoke_holds
+from manipulation.skills.crank import SpokeHold, spoke_holds
 from manipulation.skills.initial_state import InitialState
 from manipulation.skills.outcome import (
     ObjectState,
@@ -207,8 +207,7 @@ def _turn_once(
             case Hold.ACROSS:
                 turn, part_rad = hold_across(attempt, wheel, angle_rad, span_rad)
             case Hold.SPOKES:
-                enough_m = SPARE_PUSH * belief.effort_nm / (2.0 * PUSH_N)
-                holds = spoke_holds(wheel, attempt.context.hand, angle_rad, sign, least_arm_m=enough_m)
+                holds = _spokes(attempt, wheel, belief, angle_rad, sign)
                 turn, part_rad = behind_two_spokes(attempt, wheel, holds, span_rad)
             case Hold.RIM:
                 turn, part_rad = hold_the_rim(attempt, wheel, angle_rad, span_rad, belief.effort_nm)
@@ -229,11 +228,19 @@ def _turn_once(
         belief.effort_nm = max(belief.effort_nm, turn.felt_nm)
         if failure.outcome is Outcome.SLIPPED:
             belief.slipped(hold)
-        else:
-            belief.failed.add(hold)
+        elif hold is not Hold.SPOKES or _spokes(attempt, wheel, belief, angle_rad, sign)[0].arm_m <= holds[0].arm_m:
+            belief.failed.add(hold)  # else the fingers can stand nearer to the rim
         raise
     finally:
         turn.let_go()
+
+
+def _spokes(
+    attempt: Attempt, wheel: Handwheel, belief: Belief, angle_rad: float, sign: float
+) -> tuple[SpokeHold, ...]:
+    """Return the holds behind two spokes, with an arm that is long enough for the believed torque if there is one."""
+    enough_m = SPARE_PUSH * belief.effort_nm / (2.0 * PUSH_N)
+    return spoke_holds(wheel, attempt.context.hand, angle_rad, sign, least_arm_m=enough_m)
 
 
 def _note(where: InitialState, turn: WheelTurn, sign: float, lost_rad: float) -> None:

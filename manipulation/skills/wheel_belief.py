@@ -12,7 +12,7 @@ from manipulation.planning.hand import Hand
 from manipulation.skills.crank import spoke_holds
 from manipulation.skills.wheel_turn import MOVED_RAD
 
-PUSH_N = 75.0  # of one finger on a spoke
+PUSH_N = 80.0  # of one finger on a spoke
 SIDE_N = 54.0  # of the hand on the rim; where the pads slip, the finger beside a spoke takes all of it, and is pressed past it
 SPARE_M = 0.001
 LEAST_SHARE = 0.5  # of the turn that was felt; a wheel that is seen to have turned less has not followed the hand

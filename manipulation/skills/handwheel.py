@@ -235,9 +235,7 @@ def _turn_once(
         turn.let_go()
 
 
-def _spokes(
-    attempt: Attempt, wheel: Handwheel, belief: Belief, angle_rad: float, sign: float
-) -> tuple[SpokeHold, ...]:
+def _spokes(attempt: Attempt, wheel: Handwheel, belief: Belief, angle_rad: float, sign: float) -> tuple[SpokeHold, ...]:
     """Return the holds behind two spokes, with an arm that is long enough for the believed torque if there is one."""
     enough_m = SPARE_PUSH * belief.effort_nm / (2.0 * PUSH_N)
     return spoke_holds(wheel, attempt.context.hand, angle_rad, sign, least_arm_m=enough_m)

@@ -32,6 +32,16 @@ from simbackend.panel_state import build
 
 ROOT = Path(__file__).resolve().parents[1]
 PASSING = ("mission", "started", "wall_s")  # of a report: the name with its date, and times on the wall
+DEMO = {"file": "demo"}
+VALVE_AND_SLIDER = {
+    "schema": 1,
+    "title": "Open the valve and set the slider",
+    "steps": [
+        {"kind": "set", "name": "valve", "object": "main_valve", "state": "open"},
+        {"kind": "set", "name": "slider", "object": "setpoint", "value": 70.0},
+    ],
+}
+ALONE_S = 17.0  # pass line
 HEAD = (
     "| seed | confirmed | judge agrees | pose mm | pose deg | in 95 % | readings right | by surfaces mm "
     "| cell s | wall s | peak N | note |"
@@ -98,9 +108,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="a line scanner, simulated or by its driver over an emulated wire, in place of the range camera",
     )
     parser.add_argument("--twice", action="store_true", help="repeat each mission in new processes and compare")
+    parser.add_argument(
+        "--alone", action="store_true", help="only open the valve and set the slider, and print the times"
+    )
     given = parser.parse_args(arguments)
     if given.last < given.first:
         parser.error(f"the seeds {given.first} to {given.last} are none: FIRST comes before LAST")
+    if given.alone:
+        return alone(given.cell, range(given.first, given.last + 1))
     print(f"{HEAD}\n|{' --- |' * 12}", flush=True)
     runs, others = [], []
     for seed in range(given.first, given.last + 1):
@@ -115,7 +130,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return max(summary(runs), int(bool(others)))
 
 
-def run(seed: int, cell: Path, panel: Path | None = None, scanner: str | None = None) -> Run:
+def alone(cell: Path, seeds: Sequence[int]) -> int:
+    """Open the valve and set the slider in one mission of each seed; print the times, return 1 if the line is missed."""
+    told = [run(seed, cell, asked={"mission": VALVE_AND_SLIDER}) for seed in seeds]
+    times_s = sorted(sum(step["cell_s"] for step in one.report["steps"] if step["name"] != "overview") for one in told)
+    done = sum(bool(one.report["succeeded"]) and one.judge["agrees"] for one in told)
+    is_met = done == len(told) and times_s[-1] <= ALONE_S
+    print(
+        f"{'met   ' if is_met else 'MISSED'} valve and slider alone: {done} of {len(told)} right, {times_s[0]:.1f} to "
+        f"{times_s[-1]:.1f} s on the cell's clock from the first image to the parked arm, median {np.median(times_s):.1f}"
+    )
+    return int(not is_met)
+
+
+def run(
+    seed: int, cell: Path, panel: Path | None = None, scanner: str | None = None, asked: dict[str, Any] = DEMO
+) -> Run:
     """Run and judge one mission in a new service."""
     with tempfile.TemporaryDirectory() as folder:
         is_own = panel is None and scanner is None
@@ -125,7 +155,7 @@ def run(seed: int, cell: Path, panel: Path | None = None, scanner: str | None = 
         try:
             client = Client(url=panelwright.url, timeout_s=120.0)
             clear_stop(client)
-            run_to_end(client, "/v1/missions", {"file": "demo"})
+            run_to_end(client, "/v1/missions", asked)
             name = client.get("/v1/missions")["missions"][0]["name"]
             run_to_end(client, "/v1/judge", {"mission": name})
         finally:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.arrays import Array
+from hal.errors import Unreachable
 from hal.motion import Guard, MotionReport, Quantity
 from hal.panel import Button, Mushroom
 from hal.panel.parts import LATCHED_SHARE
@@ -43,6 +44,7 @@ BESIDE_M, LEAST_ROOM_M = (
     0.045,
     0.013,
 )  # largest distance of the touched plate from the cap's edge; room of the fingertip, 2 mm more than it needs
+PLACES = 4  # of the plate that are tried
 # A plate gives nothing, so it is touched slowly: at 15 mm/s the force went up to 15 N.
 PLATE_N, PLATE_M_PER_S, PLATE_REACH_M = 2.0, 0.006, 0.006
 
@@ -203,6 +205,17 @@ def _height_sigma_m(context: SkillContext, cap: Button | Mushroom) -> float:
     return float(np.sqrt(gradient @ context.base_from_panel.covariance @ gradient + HAND_SIGMA_M**2 + FELT_SIGMA_M**2))
 
 
+def _is_above_plate(attempt: Attempt, cap: Button | Mushroom, x_m: float, y_m: float) -> bool:
+    """Go to the plate at a place beside the cap; returns whether there is a way."""
+    heights = (PLATE_REACH_M, 0.0, -PLATE_REACH_M)
+    ways = [[panel_from_grip((float(x_m), float(y_m), z), turn) for z in heights] for turn in TURNS_RAD]
+    try:
+        attempt.begin(ways, may_touch=(), width_m=0.0, name=f"the plate beside {cap.name}")
+    except Unreachable:
+        return False
+    return True
+
+
 def _plate_height_m(attempt: Attempt, cap: Button | Mushroom) -> float | None:
     """Touch the plate beside the cap; returns its height in the estimated panel frame, m, or None without a place."""
     panel = attempt.context.panel
@@ -211,15 +224,10 @@ def _plate_height_m(attempt: Attempt, cap: Button | Mushroom) -> float | None:
     points = np.array([np.array(cap.position_m) + r * np.array([np.cos(a), np.sin(a)]) for r in radii for a in around])
     half = np.array([panel.width_m, panel.height_m]) / 2 - LEAST_ROOM_M
     free = points[(room_m(panel, points) >= LEAST_ROOM_M) & (np.abs(points) <= half).all(axis=1)]
-    if len(free) == 0:
-        return None
+    places = free[:: max(1, len(free) // PLACES)][:PLACES]
     attempt.leave()
-    x, y = (float(along) for along in free[0])
-    heights = (PLATE_REACH_M, 0.0, -PLATE_REACH_M)
-    attempt.begin(
-        [[panel_from_grip((x, y, z), turn) for z in heights] for turn in TURNS_RAD],
-        may_touch=(), width_m=0.0, name=f"the plate beside {cap.name}",
-    )  # fmt: skip
+    if not any(_is_above_plate(attempt, cap, x, y) for x, y in places):
+        return None
     start = attempt.pose()
     goal = shifted(start, (0.0, 0.0, 2.0 * PLATE_REACH_M))
     met = meet(attempt, goal, name="touch the plate", speed_m_per_s=PLATE_M_PER_S, stop_n=PLATE_N, ticks=TOUCH_TICKS)

@@ -27,6 +27,10 @@ REACH_TURNS_RAD = np.linspace(-np.pi, np.pi, 12, endpoint=False)
 FINGERS = ("finger_left", "finger_right")
 
 
+def _always() -> bool:
+    return True
+
+
 def _no_progress(_fraction: float, _text: str) -> None:
     return None
 
@@ -45,6 +49,7 @@ class SkillContext:
         floor_z_m: height of the floor in the base frame.
         obstacles: further boxes in the base frame.
         progress: called with a fraction and a sentence.
+        is_in_place: whether the newest look shows the panel where its pose has it; nothing is tried again where it does not.
         seed: random seed of the transfer planner.
     """
 
@@ -60,6 +65,7 @@ class SkillContext:
     floor_z_m: float = 0.0
     obstacles: tuple[CollisionBox, ...] = ()
     progress: Callable[[float, str], None] = _no_progress
+    is_in_place: Callable[[], bool] = _always
     seed: int = 0
 
     @property

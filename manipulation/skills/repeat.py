@@ -32,6 +32,7 @@ def perform(
 ) -> SkillReport:
     """Try a stroke, retreat, read back, and try at most twice more while the read-back does not show the target.
 
+    There is no further try where the look shows that the panel is not where its pose has it.
     A stroke that felt the target state itself (`Attempt.felt`) needs no read-back. A look that shows the target is no proof
     where the fingers felt the contrary, or where the hand has missed the control in every try.
 
@@ -69,6 +70,8 @@ def perform(
         if outcome is Outcome.STALLED and seen is None and not repeats():
             cause += "; it is unknown whether it had an effect, and another try might undo it"
             break
+        if not context.is_in_place():
+            break  # the hand would go to where the control was
         if outcome is Outcome.STIFF or (outcome in (Outcome.SLIPPED, Outcome.UNVERIFIED) and not repeats()):
             break
     return SkillReport(

@@ -113,7 +113,7 @@ def _operate(
     current = None if now is None else object_state(now, eye.witness)
     if current is not None:
         current = replace(current, turned_rad=session.world.turned_rad.get(panel_object.name))
-    context = skill_context(session)
+    context = replace(skill_context(session), is_in_place=lambda: not eye.is_off_its_place)
     eye.forget()  # from now on the control may stand anywhere, also after a device that fails in the stroke
     report = operate(context, panel_object, target, current=current, verify=eye.verify())
     if panel_object.turns_round and report.reached is not None:

@@ -187,6 +187,16 @@ def test_a_failure_retreats_and_keeps_its_name_when_the_look_agrees() -> None:
     assert work.mover.asked.count("retreat") == 3
 
 
+def test_the_hand_does_not_go_again_to_where_a_moved_panel_was() -> None:
+    """Drills 20811 and 20823: a look showed that the door had swung, and two more tries met it with 144 and 160 N."""
+
+    def miss(attempt: Attempt) -> float:
+        raise SkillFailure(Outcome.MISSED, "not there")
+
+    result = deed(replace(context(COMPLETED), is_in_place=lambda: False), miss, [None, None, None])
+    assert result.outcome is Outcome.MISSED and result.attempts == 1
+
+
 def test_a_turn_of_a_selector_ends_by_its_torque_in_either_direction() -> None:
     """Drill 20608: fingers that turned on about a blocked bar rolled off it, and were wedged with 182 N."""
     work, turns = context(COMPLETED), []

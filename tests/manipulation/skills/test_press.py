@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.errors import InvalidRequest
+from hal.errors import InvalidRequest, Unreachable
 from hal.geometry import UncertainPose, transform_rpy
 from hal.motion import DeclaredMotion, Hold, MotionOutcome, MotionReport
 from hal.panel import Button, Mushroom, Panel, load_panel
 from manipulation.planning.time_parameterization import SpeedLimits
+from manipulation.skills.attempt import Attempt
 from manipulation.skills.button import button
 from manipulation.skills.cap import state_by_height, stop_force_n
 from manipulation.skills.context import SkillContext
@@ -63,6 +64,26 @@ def test_a_latching_button_is_pressed_only_if_it_is_felt_to_be_otherwise(
     assert told.peak_force_n > 1.0 and "felt" in told.cause
     assert not is_there or ("felt and seen" in told.cause and "touch the plate" in mover.asked)
     assert told.is_done and told.seen is not None and told.seen.state == target
+
+
+@pytest.mark.parametrize("blocked", [1, 99])
+def test_a_cap_is_pressed_though_there_is_no_way_to_the_plate_beside_it(
+    blocked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mushroom of panel 410005 was not pressed, because no path led to the nearest place of the plate."""
+    begin, refused = Attempt.begin, []
+
+    def shy(attempt: Attempt, options: Any, *, name: str, **rest: Any) -> int:
+        if name.startswith("the plate") and len(refused) < blocked:
+            refused.append(name)
+            raise Unreachable("no path", hint="none")
+        return begin(attempt, options, name=name, **rest)
+
+    monkeypatch.setattr(Attempt, "begin", shy)
+    context = before(the_button(), is_latched=False, sigma_m=0.02)
+    told = button(context, context.panel.object("hold"), "pressed", current=None, verify=lambda: None)
+    assert ("touch the plate" in context.mover.asked) == (blocked == 1) and len(refused) == min(blocked, 4)
+    assert context.mover.is_latched and told.is_done
 
 
 @pytest.mark.parametrize("shown", ["released", None])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.errors import Unreachable
@@ -34,6 +35,8 @@ STOP_FLOOR_N = 15.0
 EFFORT_SPREAD = 1.6  # three sigma of the panel file's effort tolerance
 BOTTOM_N = 6.0  # beyond the spring force at full travel, where the cap is at its stop
 GONE_N, GONE_SAMPLES = 0.8, 3  # the fingertip has left the cap when this many samples are below this force
+UPRIGHT = Rotation.identity()
+TILTS = tuple(Rotation.from_rotvec(0.08 * np.array(axis)) for axis in ([1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]))
 FREE_M = 0.003  # way of a release beyond the place of first contact
 HAND_SIGMA_M = 0.0005  # of the tips along the fingers relative to the camera, and of the cap's height in the file
 FELT_SIGMA_M = 0.0004  # of the height difference of two touches, and of a cap's height in the file
@@ -87,10 +90,7 @@ def touch(attempt: Attempt, cap: Button | Mushroom) -> Touch:
     Raises:
         SkillFailure: no cap is there (`missed`).
     """
-    x, y = cap.position_m
-    heights = (cap.height_m + STANDOFF_M, cap.height_m + SEEK_ABOVE_M, cap.height_m - cap.travel_m)
-    ways = [[panel_from_grip((x, y, z), turn) for z in heights] for turn in TURNS_RAD]
-    attempt.begin(ways, may_touch=(cap.name,), width_m=0.0, name=cap.name)
+    _go_above(attempt, cap)
     early = attempt.advance(STANDOFF_M - SEEK_ABOVE_M, name="approach", stop_n=SEEK_N)
     if early.tripped is not None:
         attempt.advance(-FREE_M, name="lift", speed_m_per_s=LIFT_M_PER_S, stop_n=FREE_N)
@@ -101,8 +101,35 @@ def touch(attempt: Attempt, cap: Button | Mushroom) -> Touch:
         raise SkillFailure(Outcome.MISSED, "no cap was met where it should be", reached=0.0)
     ahead = start.rotation.apply([0.0, 0.0, 1.0])
     tip = start.translation + met.way_m * ahead
-    height = float((attempt.context.panel_pose.inv().apply(tip))[2])
+    height = float((attempt.context.panel_pose.inv().apply(tip))[2]) - _edge_m(attempt, cap, ahead)
     return Touch(tip_m=tip, ahead=ahead, height_m=height)
+
+
+def _go_above(attempt: Attempt, cap: Button | Mushroom) -> None:
+    """Go to the standoff above the cap; with the hand a little aslant where the arm reaches no other way.
+
+    A hand at a right angle to the plate may be in line with the forearm, where a small error turns the wrist far.
+    """
+    try:
+        attempt.begin(_ways(cap, UPRIGHT), may_touch=(cap.name,), width_m=0.0, name=cap.name)
+    except Unreachable:
+        attempt.begin(
+            [way for tilt in TILTS for way in _ways(cap, tilt)], may_touch=(cap.name,), width_m=0.0, name=cap.name
+        )
+
+
+def _ways(cap: Button | Mushroom, tilt: Rotation) -> list[list[RigidTransform]]:
+    """Return for each turn of the hand the poses (panel_from_grip) at the standoff, above the cap, and at its stop."""
+    top = (*cap.position_m, cap.height_m)
+    on_cap = [panel_from_grip(top, turn) * RigidTransform.from_rotation(tilt) for turn in TURNS_RAD]
+    return [[shifted(pose, (0.0, 0.0, -z)) for z in (STANDOFF_M, SEEK_ABOVE_M, -cap.travel_m)] for pose in on_cap]
+
+
+def _edge_m(attempt: Attempt, cap: Button | Mushroom, ahead: Array) -> float:
+    """Return how far the middle of a fingertip that points `ahead` (3,) is above the cap that its edge touches."""
+    cosine = -float(ahead @ attempt.context.panel_pose.rotation.apply([0.0, 0.0, 1.0]))
+    half_m = min(max(attempt.context.hand.closed_half_m), cap.radius_m)
+    return half_m * float(np.sqrt(max(0.0, 1.0 - cosine**2)))
 
 
 def push(attempt: Attempt, cap: Button | Mushroom, first: Touch, *, way_m: float, is_firm: bool) -> Give:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +38,13 @@ def test_the_skill_learns_how_sure_the_look_is() -> None:
     assert object_state(reading(0.3), panel_object).value == 71.1
 
 
+@dataclass(frozen=True)
+class Context:
+    """As much of a skill's context as is set for a deed."""
+
+    is_in_place: Callable[[], bool] = lambda: True
+
+
 def test_a_control_is_not_known_any_more_once_a_stroke_began_that_a_fault_ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -48,7 +56,7 @@ def test_a_control_is_not_known_any_more_once_a_stroke_began_that_a_fault_ended(
     slider: Any = load_panel(PANEL).object("setpoint")
     session: Any = SimpleNamespace(panel=load_panel(PANEL), world=WorldModel())
     session.world.note_readings([reading(0.3)])
-    monkeypatch.setattr(manipulate, "skill_context", lambda _: None)
+    monkeypatch.setattr(manipulate, "skill_context", lambda _: Context())
     monkeypatch.setattr(manipulate, "operate", fail)
     with pytest.raises(DeviceFault):
         manipulate._operate(session, manipulate._Eye(session, slider, True), slider, 70.0, reading(0.3))

@@ -170,17 +170,6 @@ def step(depth_m: Array, force_n: Array) -> float:
     return float(depth_m[first + 1 + int(gain.argmax())])
 
 
-def against_turn(start: RigidTransform, hub_m: Array, axis: Array) -> tuple[float, float, float]:
-    """Return the unit vector in tool axes against a turn of the tool about `axis` through `hub_m` (base frame).
-
-    The tool turns with the object, so this direction is constant in tool axes. Friction in other directions is not part
-    of the effort of the object and does not count.
-    """
-    ahead = start.rotation.inv().apply(np.cross(axis, start.translation - hub_m))
-    against = -ahead / np.linalg.norm(ahead)
-    return float(against[0]), float(against[1]), float(against[2])
-
-
 def centre_between(attempt: Attempt, *, room_m: float, what: str) -> None:
     """Feel the object between the open fingers on both sides and go to the middle, before a cage or a grasp.
 

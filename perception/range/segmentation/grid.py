@@ -21,8 +21,6 @@ from perception.range.segmentation.tangents import tangent_planes
 from perception.range.sensor import RangeSensorModel
 from perception.range.tiles import for_each_tile
 
-Ints = NDArray[np.int32]
-
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
 WIDEST_RADIUS = 3  # blocks
 LARGE_SIDE_PX = 1024  # shorter side of an image from which the size of blocks grows with the image

@@ -16,7 +16,6 @@ from hal.jit import as_numpy_scalar, compiled
 JUMP_SIGMAS = 4.0  # noise allowed in a depth step that is not a jump
 LEAST_SHARE = 0.4  # least share of the window's blocks that no jump separates from the middle block
 TURN_RAD = 0.15  # between neighbouring blocks of one face
-WINDOW_BEND = 0.0745 * TURN_RAD  # rms deviation per length of a parabola that turns by TURN_RAD over twice that length
 LEAST_FACING = 0.15  # below this cosine of incidence normals are too inaccurate
 STEADY_RMS = 1.8  # sigmas; a tangent plane with larger residuals lies on a crease or in noise
 GAP = 8  # number of successive empty blocks that end a run

@@ -25,7 +25,6 @@ ACROSS, FACE_BESIDE = np.linspace(-0.08, 0.08, 17), np.linspace(0.12, 0.2, 9)  #
 BEYOND_TAIL = (0.42, 0.6)  # of the radius: beyond the other end of another pointer, and within every red one
 LEAST_LACKING, RED_LACKS = 0.02, 0.75  # green that a pointer takes from the strip, and red that a red one lacks at most
 LENGTHS = np.linspace(0.3, 1.0, 36)  # shares of the radius
-LIGHT_RAD = np.deg2rad(6.0)  # lightness is searched for the pointer's sharper edge within this
 
 
 def redness(picture: Image, u: float, v: float, radius: float) -> NDArray[np.float32]:

@@ -83,6 +83,26 @@ def test_a_cap_that_looks_alike_from_afar_is_read_by_its_height(session: Session
     assert len(found.pictures) == len(straight.pictures), "no look from a side is needed"
 
 
+def test_a_range_image_that_was_taken_before_proves_a_height_without_another_way(session: Session) -> None:
+    unread = close_ups(session, ("hold",)).readings["hold"]
+    range_detection._face(session, session.panel.object("hold").point_m, name="face the cap")
+    near = range_detection.scan_beside(session)
+    inspect.go_to_overview(session)
+    stood = session.mover.state().position_rad
+    told = range_detection.read_by_height(session, [unread], near)
+    assert told["hold"].state == truth_of(session, "hold").state
+    assert np.array_equal(session.mover.state().position_rad, stood)
+
+
+def test_a_look_goes_on_without_a_range_image_from_its_place(session: Session) -> None:
+    scanner = session.connection.device("range_scanner")
+    scanner.inject_fault(Fault.SILENT)
+    try:
+        assert range_detection.scan_beside(session) == ()
+    finally:
+        scanner.inject_fault(None)
+
+
 def test_a_scanner_that_fails_leaves_the_cap_to_looks_from_close_by(session: Session) -> None:
     scanner = session.connection.device("range_scanner")
     straight = close_ups(session, ("hold",))

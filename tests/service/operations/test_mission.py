@@ -29,7 +29,14 @@ from service.operations.find_panel import locate
 from service.operations.inspect import look_close
 from service.operations.locate import go_to_overview, object_depths, rims_in, scan_plate
 from service.operations.mission import run_mission
-from service.operations.range_detection import CLOSER, OVERVIEW, check_surfaces, need_its_place, view_surfaces
+from service.operations.range_detection import (
+    CLOSER,
+    OVERVIEW,
+    check_surfaces,
+    need_its_place,
+    scan_beside,
+    view_surfaces,
+)
 from service.operations.session import OperationContext, Session
 from service.operations.travel import go_to_joints
 from service.processes.cell import CellRuntime
@@ -222,7 +229,11 @@ def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_
         stood = session.mover.state().position_rad
         checks, pictures = check_surfaces(session, first)
         moved = np.abs(session.mover.state().position_rad - stood).max()
+        near = scan_beside(session)
         go_to_overview(session)
+        stood = session.mover.state().position_rad
+        again, _ = check_surfaces(session, first, near)
+        assert np.array_equal(session.mover.state().position_rad, stood), "a range image from near the wheel is enough"
         settle(session)
         looks = [look(session)]
         for place in ("flow", "mode"):
@@ -238,6 +249,7 @@ def test_a_wheel_beside_its_place_in_the_file_is_looked_at_again_stated_and_not_
     wheel = by_name["bypass"]
     assert wheel.stands_elsewhere and wheel.seen_from == CLOSER and moved > 0.05
     assert wheel.off_m == pytest.approx(0.008, abs=0.002)
+    assert [check.stands_elsewhere for check in again] == [check.stands_elsewhere for check in checks]
     assert [picture.name for picture in pictures] == ["surfaces", "surfaces-bypass"]
     with pytest.raises(NotFound, match="bypass is not operated"):
         need_its_place(checks, "bypass")

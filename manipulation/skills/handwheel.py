@@ -28,7 +28,10 @@ from manipulation.skills.wheel_turn import WheelTurn
 
 DRAGGED_RAD = 0.2  # largest turn by which a hand that lets go drags the wheel back
 GAINED_RAD = 0.3  # a wheel that stopped after a turn of so much is turned on
-SPARE_PUSH = 1.3  # of the torque behind spokes, in multiples of the believed one
+SPARE_PUSH = (
+    1.05  # of the torque behind spokes, in multiples of the believed one: fingers near the rim may be wedged by it
+)
+LONGER_M = 1e-4
 TOLERANCE_RAD = np.radians(6.0)
 AT_STOP_RAD = 0.35
 SAME_RAD = 0.6  # a look that differs by more from where the wheel was left shows that somebody else has turned it
@@ -228,8 +231,8 @@ def _turn_once(
         belief.effort_nm = max(belief.effort_nm, turn.felt_nm)
         if failure.outcome is Outcome.SLIPPED:
             belief.slipped(hold)
-        elif hold is not Hold.SPOKES or _spokes(attempt, wheel, belief, angle_rad, sign)[0].arm_m <= holds[0].arm_m:
-            belief.failed.add(hold)  # else the fingers can stand nearer to the rim
+        elif hold is not Hold.SPOKES or not _has_longer_arm(attempt, wheel, belief, holds[0].arm_m):
+            belief.failed.add(hold)
         raise
     finally:
         turn.let_go()
@@ -237,8 +240,14 @@ def _turn_once(
 
 def _spokes(attempt: Attempt, wheel: Handwheel, belief: Belief, angle_rad: float, sign: float) -> tuple[SpokeHold, ...]:
     """Return the holds behind two spokes, with an arm that is long enough for the believed torque if there is one."""
-    enough_m = SPARE_PUSH * belief.effort_nm / (2.0 * PUSH_N)
+    enough_m = max(belief.least_arm_m, SPARE_PUSH * belief.effort_nm / (2.0 * PUSH_N))
     return spoke_holds(wheel, attempt.context.hand, angle_rad, sign, least_arm_m=enough_m)
+
+
+def _has_longer_arm(attempt: Attempt, wheel: Handwheel, belief: Belief, arm_m: float) -> bool:
+    """Note that pushing the spokes at `arm_m` from the hub did not do; returns whether the fingers can stand further."""
+    belief.least_arm_m = arm_m + LONGER_M
+    return _spokes(attempt, wheel, belief, 0.0, 1.0)[0].arm_m >= belief.least_arm_m
 
 
 def _note(where: InitialState, turn: WheelTurn, sign: float, lost_rad: float) -> None:

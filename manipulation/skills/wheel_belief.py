@@ -43,6 +43,7 @@ class Belief:
         failed: holds that were tried in vain.
         tried_nm: largest torque that was put on the wheel.
         has_slipped: whether the pads slipped in a hold, so that the torque at which the wheel gives way is not known.
+        least_arm_m: how far from the hub the spokes must be pushed, because nearer to it did not do.
         lost_rad: by how much less the wheel turns in a hold than is felt, because it springs back when it is let go.
     """
 
@@ -50,6 +51,7 @@ class Belief:
     failed: set[Hold] = field(default_factory=set)
     tried_nm: float = 0.0
     has_slipped: bool = False
+    least_arm_m: float = 0.0
     lost_rad: float = 0.0
     _first_rad: float | None = None
     _last: tuple[Hold, float, float] | None = None

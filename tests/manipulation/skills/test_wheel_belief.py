@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 
 from hal.panel import Handwheel
 from manipulation.planning.hand import Hand
-from manipulation.skills.handwheel import _given_up
+from manipulation.skills.attempt import Attempt
+from manipulation.skills.handwheel import _given_up, _has_longer_arm, _spokes
 from manipulation.skills.outcome import Outcome
 from manipulation.skills.wheel_belief import Belief, Hold, across_gap_m, torques_nm
 
@@ -81,3 +85,13 @@ def test_a_wheel_that_never_moved_is_named_stiff_with_the_largest_torque_and_one
     belief.slipped(Hold.RIM)
     slipped = _given_up(belief, 1.05)
     assert slipped.outcome is Outcome.SLIPPED and "the pads slipped at 2.9 N m before" in slipped.cause
+
+
+def test_spokes_that_did_not_do_are_pushed_further_from_the_hub_once() -> None:
+    """410112 met the side force before the torque that its arm takes, and was called stiff; the longer arm turns it."""
+    attempt, belief = cast(Attempt, SimpleNamespace(context=SimpleNamespace(hand=HAND))), Belief(effort_nm=0.5)
+    wide_m = _spokes(attempt, LARGE, belief, 0.0, 1.0)[0].arm_m
+    assert _has_longer_arm(attempt, LARGE, belief, wide_m)
+    narrow_m = _spokes(attempt, LARGE, belief, 0.0, 1.0)[0].arm_m
+    assert narrow_m > wide_m
+    assert not _has_longer_arm(attempt, LARGE, belief, narrow_m)

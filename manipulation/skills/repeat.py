@@ -32,14 +32,12 @@ def perform(
 ) -> SkillReport:
     """Try a stroke, retreat, read back, and try at most twice more while the read-back does not show the target.
 
-    There is no further try where the look shows that the panel is not where its pose has it.
-    A stroke that felt the target state itself (`Attempt.felt`) needs no read-back. A look that shows the target is no proof
-    where the fingers felt the contrary, or where the hand has missed the control in every try.
+    There is no further try where the look shows that the panel has moved. A stroke that felt the target itself
+    (`Attempt.felt`) needs no read-back; a look is no proof where the fingers felt the contrary, or missed in every try.
 
     Args:
         doubt: why a look that does not show the target does not show the contrary either; nothing if it does.
-        repeats: whether a stroke that ended as declared may be tried again when the read-back disagrees, asked after each.
-            Not for a button, whose second press undoes the first.
+        repeats: asked after each stroke that ended as declared and is not read back; not for a button that toggles.
 
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on; the caller parks when that is possible.
@@ -70,15 +68,13 @@ def perform(
         if outcome is Outcome.STALLED and seen is None and not repeats():
             cause += "; it is unknown whether it had an effect, and another try might undo it"
             break
-        if not context.is_in_place():
-            break  # the hand would go to where the control was
-        if outcome is Outcome.STIFF or (outcome in (Outcome.SLIPPED, Outcome.UNVERIFIED) and not repeats()):
+        is_final = outcome is Outcome.STIFF or (outcome in (Outcome.SLIPPED, Outcome.UNVERIFIED) and not repeats())
+        if is_final or not context.is_in_place():
             break
     return SkillReport(
         skill=skill, object=object_name, target=target, outcome=outcome, cause=cause, reached=reached, seen=seen,
-        attempts=tries, started_s=started_s, ended_s=context.mover.state().stamp_s,
-        peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0),
-        motions=tuple(attempt.reports), was_missed=was_missed,
+        attempts=tries, started_s=started_s, ended_s=context.mover.state().stamp_s, motions=tuple(attempt.reports),
+        peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0), was_missed=was_missed,
     )  # fmt: skip
 
 

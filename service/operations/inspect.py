@@ -33,7 +33,7 @@ from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
 from service.report.plots import cut_out, png_of
 from service.report.upright import quarter_turns, turned_image, turned_points
-from service.schema.mission_results import ReadingResult
+from service.schema.mission_results import ObjectPlace, ReadingResult
 from service.schema.requests import InspectRequest, RecogniseRequest
 from service.schema.results import InspectResult
 
@@ -343,3 +343,13 @@ def _answer(session: Session, found: Inspection, least_confidence: float) -> Ins
         missing=list(missing(found.readings.values(), asked)),
         pictures=pictures,
     )
+
+
+def places_in(session: Session, found: Inspection) -> list[ObjectPlace]:
+    """Return the position of every object in the base frame, m."""
+    pose = session.known_panel().parent_from_child
+    return [
+        ObjectPlace(name=r.name, kind=r.kind, centre_in_base_m=pose.apply(r.centre_m))
+        for r in found.readings.values()
+        if r.centre_m is not None
+    ]

@@ -21,8 +21,7 @@ from manipulation import ObjectState, Outcome, SkillReport, Verify, free_hand, o
 from perception.vision import ObjectReading, said
 from service.feasibility import target_of, text_of
 from service.operations.inspect import ensure_located, look_close, look_past, tell
-from service.operations.locate import OFF_PLACE_M, look_again
-from service.operations.range_detection import ensure_space_is_known
+from service.operations.locate import OFF_PLACE_M, ensure_space_is_known, look_again
 from service.operations.session import Session
 from service.operations.travel import park, skill_context
 from service.report.plots import png_of

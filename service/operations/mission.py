@@ -5,15 +5,15 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from fusion import Observation, PoseTolerance, error_budget
+from fusion import Observation, PoseTolerance
 from hal.devices import DeviceKind
-from hal.errors import CellError, DeviceError, InvalidRequest, NotFound, PerceptionError, Unreachable
+from hal.errors import CellError, DeviceError, InvalidRequest, PerceptionError, Unreachable
 from hal.geometry import compose
 from perception.vision import PanelWay
 from service.errors import Defect
@@ -24,29 +24,33 @@ from service.missions.interpreter import Interpreter, leaves_of
 from service.missions.progress import FILE, Progress, load_progress
 from service.operations.acquisition import Look, Scan, settle
 from service.operations.find_panel import Located, locate, panel_observations, ways_of
-from service.operations.inspect import Inspection, inspect_close, inspect_here, need_all_present, reading_result, tell
+from service.operations.inspect import (
+    Inspection,
+    inspect_close,
+    inspect_here,
+    need_all_present,
+    places_in,
+    reading_result,
+    tell,
+)
 from service.operations.locate import (
     ScannedPlane,
     SeenRim,
     go_to_overview,
     locate_from_overview,
     object_depths,
-    plate_in,
     rim_observations,
     rims_in,
     scan_plate,
 )
 from service.operations.manipulate import other_than_shown, refused_action, usual_actions, work
 from service.operations.range_detection import (
-    FACING,
-    OVERVIEW,
     SurfaceView,
     check_surfaces,
-    ensure_space_is_known,
     need_its_place,
-    view_surfaces,
+    surfaces_of_mission,
 )
-from service.operations.sense import feel, fuse_and_remember, fused_result, mounts_of
+from service.operations.sense import feel, fuse_and_remember, fused_result, pose_error
 from service.operations.session import OperationContext, Session, panel_object_or_all
 from service.operations.travel import leave_the_panel, park, plan_mission
 from service.problem import problem_of
@@ -57,7 +61,7 @@ from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
 from service.schema.mission_file import FeelStep, InspectStep, SetStep
 from service.schema.mission_request import MissionRequest
-from service.schema.mission_results import MissionResult, ObjectPlace, StepResult, SurfaceCheck
+from service.schema.mission_results import MissionResult, StepResult, SurfaceCheck
 from service.schema.requests import ActionBody, WantedPose
 from service.schema.results import FittedPlate, FoundBy, estimated
 
@@ -104,8 +108,7 @@ def run_mission(context: OperationContext, request: MissionRequest) -> MissionRe
         record.problem = problem_of(error)
         _park_after(session, record, error)
         raise
-    except Exception as defect:
-        # Park the arm also after a defect of this program; the task then reports the defect.
+    except Exception as defect:  # the arm is parked, and the task reports the defect
         what = f"{type(defect).__name__}: {defect}"
         record.problem = problem_of(Defect(what, hint="the log has the traceback; please report it"))
         _park_after(session, record, defect)
@@ -158,10 +161,10 @@ def _run(worker: _Worker, interpreter: Interpreter) -> None:
         overview = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, overview, "recognised")
         need_all_present(overview, session)
-        record.objects = _places(session, overview)
+        record.objects = places_in(session, overview)
         worker.looks += [view.look for view in overview.pictures]
         is_touching = any(isinstance(step, SetStep | FeelStep) for step in interpreter.progress.all_steps())
-        worker.surfaces = _surfaces(part, worker.found.plane, is_touching=is_touching)
+        worker.surfaces = surfaces_of_mission(part, worker.found.plane, is_touching=is_touching)
     interpreter.run()
     if record.depths is None:
         _note_depths(session, record, rims_in(session, worker.looks))
@@ -178,8 +181,7 @@ class _Worker:
         leaves: number of steps without steps of their own, by which the progress is shared out.
         found: the panel as it was located.
         surfaces: the objects with a relief in a range image; None without a range scanner.
-        looks: images in which objects were read, whose rims are fused into the pose.
-        scans: range images from the poses of those looks.
+        looks, scans: images in which objects were read, whose rims are fused, and range images from the same places.
         checks: comparison of the objects with their surfaces.
     """
 
@@ -321,29 +323,13 @@ def _find(session: Session, record: MissionRecord, tolerance: PoseTolerance) -> 
             plane = scan_plate(part)
             _note_plane(record, plane)
             found = replace(found, plane=plane)
-    if _pose_error(session, found.observations, tolerance) > 1.0:
+    if pose_error(session, found.observations, tolerance) > 1.0:
         with _step(session, "square view", 0.13, 0.19) as part:
             part.progress(0.0, "drive to the square view")
             go_to_overview(part)
             found = replace(found, views=(*found.views, locate(part)))
     _note_found(record, found.views[-1])
     return found
-
-
-def _surfaces(session: Session, overview: ScannedPlane | None, *, is_touching: bool) -> SurfaceView | None:
-    """Find the objects with a relief in a range image of the whole panel, or else in that of the overview."""
-    image = ensure_space_is_known(session) if is_touching else None  # from the overview it is a short way
-    if image is not None:
-        with suppress(NotFound):
-            return view_surfaces(session, plate_in(session, image), FACING)
-    return None if overview is None else view_surfaces(session, overview, OVERVIEW)
-
-
-def _pose_error(session: Session, known: Sequence[Observation], tolerance: PoseTolerance) -> float:
-    """Return the mean square error of the pose that the observations give, in units of the tolerance."""
-    base_from_panel = session.known_panel().parent_from_child
-    budget = error_budget(known, mounts_of(session, known), base_from_panel, lenses=session.one_sigma_lenses())
-    return tolerance.error_of(budget.covariance, base_from_panel)
 
 
 @contextmanager
@@ -404,16 +390,6 @@ def _note_pictures(record: MissionRecord, found: Inspection, name: str) -> None:
     for k, picture in enumerate(found.pictures):
         record.pictures.append(Picture(name=f"{name}-{k}", title=picture.title, png=png_of(picture.pixels)))
     record.crops |= found.crops()
-
-
-def _places(session: Session, found: Inspection) -> list[ObjectPlace]:
-    """Return the position of every object in the base frame, m."""
-    pose = session.known_panel().parent_from_child
-    return [
-        ObjectPlace(name=r.name, kind=r.kind, centre_in_base_m=pose.apply(r.centre_m))
-        for r in found.readings.values()
-        if r.centre_m is not None
-    ]
 
 
 def _drawing(session: Session, located: Located) -> Picture:

@@ -2,8 +2,7 @@
 
 This covers the kinds with a relief, such as mushroom buttons and handwheels. An object that is not found, or is found
 in another place, is scanned again from a shorter distance. The panel file is not corrected: an object that is still
-found in another place is reported and not operated. Caps whose states look alike are read by their heights. What stands
-before the panel, such as a cable, is noted for the paths of the arm.
+found in another place is reported and not operated. Caps whose states look alike are read by their heights.
 """
 
 from __future__ import annotations
@@ -14,17 +13,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import RigidTransform
 
-from hal.arrays import Array
-from hal.calibration import CameraIntrinsics
-from hal.devices import DeviceKind, RangeScannerCapabilities
-from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable, Unsupported
+from hal.devices import DeviceKind
+from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable
 from hal.geometry import UncertainPose
 from hal.panel import Cap, Panel, PanelObject
-from manipulation import CollisionBox, SkillContext
 from perception.range import (
     PanelScan,
     RangeScene,
@@ -33,28 +27,22 @@ from perception.range import (
     analyse,
     check_place,
     find_objects,
-    find_obstacles,
     measure_cap,
     outline_px,
     states_agree,
 )
 from perception.vision import ObjectReading, viewpoints
-from service.operations.acquisition import Scan, device_of_kind, has_range_camera, scan, settle
-from service.operations.locate import ScannedPlane, plate_in, scan_plate
+from service.operations.acquisition import Scan, has_range_camera, scan, settle
+from service.operations.locate import ScannedPlane, ensure_space_is_known, plate_in, scan_plate
 from service.operations.session import Session
-from service.operations.travel import go_to_first, skill_context
+from service.operations.travel import go_to_first
 from service.report.plots import png_of
 from service.report.record import Picture
 from service.report.surfaces import Mark, surfaces_picture
 from service.schema.mission_results import SurfaceCheck
 
 OVERVIEW, FACING, CLOSER = "the overview", "before the panel", "a closer look"
-VIEW_SLACK_M = 0.0  # around the panel, in a view of all of it
-FLOOR_SLACK_M, HAND_M = 0.03, 0.05  # what is so near to the floor or the finger tips is the floor or the hand
-TURN_ARM_M = 0.3  # a turn of the scanner counts as the way of a point at this distance
-EDGE_PX = 2
 FOOTPRINT_RATIO = 1.4  # of an object with the plate around it to its footprint
-ARM_SLACK_M = 0.03  # what is so near to the model of the arm is the arm, which a folded arm's scanner sees
 SURE_ODDS = 6.0  # least logarithm of the odds of a state that a height proves
 
 
@@ -272,87 +260,6 @@ def _picture(session: Session, view: SurfaceView, name: str) -> Picture:
     return Picture(name=name, title=title, png=png_of(surfaces_picture(view.scene, marks)))
 
 
-def ensure_space_is_known(session: Session) -> Scan | None:
-    """Look with the range camera for what stands before the panel, unless that was done since it was located.
-
-    Returns the range image, which shows the whole panel; None if there is none.
-
-    A line scanner is not swept for it. Where the camera does not get to see the whole panel, or fails, that is told as
-    progress, and the paths are planned among what the panel file describes.
-
-    Raises:
-        NotFound: the panel has not been located.
-        Stopped, MotionError, Cancelled: the cell cannot go on.
-    """
-    if session.world.obstacles is not None or not has_range_camera(session):
-        return None
-    session.world.note_obstacles(())
-    session.progress(0.0, "look for what stands before the panel")
-    try:
-        name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
-        views = viewpoints.overview_poses(
-            session.known_panel().parent_from_child, session.panel, _as_lens(device.capabilities()), VIEW_SLACK_M
-        )
-        back = session.mount(name).parent_from_child.inv()
-        context = skill_context(session)
-        here = context.kinematics.flange(session.mover.state().position_rad)
-        near = sorted((view * back for view in views), key=lambda flange: _way_m(here, flange))
-        go_to_first(session, near, name="face the panel with the scanner", thorough=False)
-        settle(session)
-        image = scan(session)
-        session.world.note_obstacles(obstacles_in(session, image))
-    except (DeviceError, PerceptionError, Unreachable, Unsupported) as error:
-        session.progress(1.0, "what stands before the panel is not known", error.what)
-        return None
-    return image
-
-
-def _way_m(one: RigidTransform, other: RigidTransform) -> float:
-    """Return how far the flange moves between two poses, with a turn counted as the way of a point at `TURN_ARM_M`."""
-    step = one.inv() * other
-    return float(np.linalg.norm(step.translation) + TURN_ARM_M * step.rotation.magnitude())
-
-
-def obstacles_in(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
-    """Return boxes in the base frame around what a range image shows before the panel; see `find_obstacles`."""
-    context, sensor = skill_context(session), image.pinhole()
-    base_from_scanner, base_from_panel = image.base_from_scanner.parent_from_child, context.panel_pose
-    in_scanner = sensor.points(np.asarray(image.depth_m, float))
-    is_measured = np.isfinite(in_scanner).all(axis=-1)
-    points = base_from_scanner.apply(in_scanner[is_measured])
-    is_own = np.zeros(is_measured.shape, bool)
-    is_own[is_measured] = _is_arm_or_hand(session, context, image, points)
-    # A pixel beside the arm may show a mean of the arm and what is behind it, which stands nowhere.
-    is_strange = (points[:, 2] > context.floor_z_m + FLOOR_SLACK_M) & ~binary_dilation(is_own, iterations=EDGE_PX)[
-        is_measured
-    ]
-    found = find_obstacles(
-        base_from_panel.inv().apply(points[is_strange]),
-        session.panel,
-        pitch_m=sensor.pitch_m(float(np.linalg.norm(base_from_scanner.translation - base_from_panel.translation))),
-        sigma_m=image.capabilities.sigma_m,
-    )
-    return tuple(
-        CollisionBox(
-            name="what stands before the panel", parent_from_box=base_from_panel * one.panel_from_box, half_m=one.half_m
-        )
-        for one in found
-    )
-
-
-def _is_arm_or_hand(session: Session, context: SkillContext, image: Scan, points_m: Array) -> NDArray[np.bool_]:
-    """Return which points (N, 3) of the base frame belong to the arm, or to the hand and what is between its fingers."""
-    base_from_flange = image.base_from_scanner.parent_from_child * session.mount(image.scanner).parent_from_child.inv()
-    x, y, z = (base_from_flange * context.flange_from_grip).inv().apply(points_m).T
-    arm = context.collision(width_m=session.mover.state().gripper_width_m)
-    is_arm = arm.distances_m(image.position_rad, points_m) < ARM_SLACK_M
-    return np.asarray(is_arm | ((z <= HAND_M) & (np.hypot(x, y) <= 2 * HAND_M)))
-
-
-def _as_lens(c: RangeScannerCapabilities) -> CameraIntrinsics:
-    return CameraIntrinsics(fx_px=c.fx, fy_px=c.fy, cx_px=c.cx, cy_px=c.cy, width_px=c.width, height_px=c.height)
-
-
 def scan_beside(session: Session) -> tuple[Scan, ...]:
     """Return a range image from the pose of a camera's look; empty without a range camera, or when it fails.
 
@@ -427,3 +334,12 @@ def _reading(unread: ObjectReading, odds: float) -> ObjectReading:
     confidence = float(1.0 / (1.0 + np.exp(-abs(odds))))
     state = "released" if odds > 0 else "pressed"
     return replace(unread, state=state, confidence=confidence, reason=None, guess=None)
+
+
+def surfaces_of_mission(session: Session, overview: ScannedPlane | None, *, is_touching: bool) -> SurfaceView | None:
+    """Find the objects with a relief in a range image of the whole panel, or else in that of the overview."""
+    image = ensure_space_is_known(session) if is_touching else None  # from the overview it is a short way
+    if image is not None:
+        with suppress(NotFound):
+            return view_surfaces(session, plate_in(session, image), FACING)
+    return None if overview is None else view_surfaces(session, overview, OVERVIEW)

@@ -33,8 +33,7 @@ from manipulation import SkillFailure, plausibility, proximity_probe, touch_poin
 from service.operations.acquisition import settle
 from service.operations.find_panel import locate, panel_observations
 from service.operations.inspect import ensure_located
-from service.operations.locate import go_to_overview, scan_plate
-from service.operations.range_detection import ensure_space_is_known
+from service.operations.locate import ensure_space_is_known, go_to_overview, scan_plate
 from service.operations.session import Session
 from service.operations.travel import skill_context
 from service.schema.fuse_request import FuseRequest
@@ -293,3 +292,10 @@ def _whose(names: Sequence[str], mounts: Sequence[Any], flange: Any, base_from_s
     """Return the name of the sensor at a pose, because the probe leaves out sensors that measured nothing."""
     gaps = [np.linalg.norm((flange * mount).translation - base_from_sensor.translation) for mount in mounts]
     return names[int(np.argmin(gaps))]
+
+
+def pose_error(session: Session, known: Sequence[Observation], tolerance: PoseTolerance) -> float:
+    """Return the mean square error of the pose that the observations give, in units of the tolerance."""
+    base_from_panel = session.known_panel().parent_from_child
+    budget = error_budget(known, mounts_of(session, known), base_from_panel, lenses=session.one_sigma_lenses())
+    return tolerance.error_of(budget.covariance, base_from_panel)

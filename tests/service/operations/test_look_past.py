@@ -18,7 +18,7 @@ from hal.simulated import Fault
 from manipulation.skills.context import panel_from_grip
 from perception.vision import viewpoints
 from perception.vision.reading import ANSWER_AT, ObjectReading, answer_at
-from service.operations import inspect, range_detection
+from service.operations import inspect, locate, range_detection
 from service.operations.inspect import Inspection, close_ups, inspect_close
 from service.operations.session import Session
 from service.operations.travel import skill_context
@@ -169,7 +169,7 @@ def test_the_benchmarks_cables_hang_clear_of_the_plate_from_border_to_border() -
 
 
 def test_no_transfer_leads_through_a_cable(session: Session) -> None:
-    range_detection.ensure_space_is_known(session)
+    locate.ensure_space_is_known(session)
     context = skill_context(session)
     grip = context.panel_pose * panel_from_grip(CABLE.path_m[1], 0.0) * context.flange_from_grip.inv()
     model = context.collision(width_m=0.0, near_plate=True, may_touch=[one.name for one in session.panel.objects])
@@ -184,7 +184,7 @@ def test_a_plate_that_is_not_where_it_was_located_is_no_obstacle(session: Sessio
     session.world.believe_panel(replace(pose, parent_from_child=nearer))
     session.world.note_obstacles(None)
     try:
-        range_detection.ensure_space_is_known(session)
+        locate.ensure_space_is_known(session)
     finally:
         session.world.believe_panel(pose)
     assert session.world.obstacles == ()

@@ -28,9 +28,7 @@ from manipulation.skills.wheel_turn import WheelTurn
 
 DRAGGED_RAD = 0.2  # largest turn by which a hand that lets go drags the wheel back
 GAINED_RAD = 0.3  # a wheel that stopped after a turn of so much is turned on
-SPARE_PUSH = (
-    1.05  # of the torque behind spokes, in multiples of the believed one: fingers near the rim may be wedged by it
-)
+SPARE_PUSH = 1.05  # of the torque behind spokes to the believed one; with more the fingers stand near the rim
 LONGER_M = 1e-4
 TOLERANCE_RAD = np.radians(6.0)
 AT_STOP_RAD = 0.35

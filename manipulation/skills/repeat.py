@@ -37,7 +37,7 @@ def perform(
 
     Args:
         doubt: why a look that does not show the target does not show the contrary either; nothing if it does.
-        repeats: asked after each stroke that ended as declared and is not read back; not for a button that toggles.
+        repeats: whether a stroke that the look denies may be tried again, asked after each; a second press undoes a first.
 
     Raises:
         DeviceFault, Stopped, Cancelled: the cell cannot go on; the caller parks when that is possible.

@@ -172,8 +172,8 @@ async def _stop(state: AppState, latch: LatchState) -> StopView:
     not_stopped: tuple[str, ...] = ()
     if latch.is_latched:
         try:
-            asked = state.in_thread(lambda: _not_stopped(state.service.supervisor.connection))
-            not_stopped = await asyncio.wait_for(asked, TELL_S)
+            async with asyncio.timeout(TELL_S):
+                not_stopped = await state.in_thread(lambda: _not_stopped(state.service.supervisor.connection))
         except (TimeoutError, Busy):
             not_stopped = ("cell: it does not answer, so that what obeys the stop is not known",)
     return StopView(

@@ -45,15 +45,15 @@ class Hub:
 
     async def wait_for(self, task: Task, timeout_s: float) -> bool:
         """Wait until the task has ended, without blocking a thread; returns whether it has."""
-        loop = asyncio.get_running_loop()
-        end_s = loop.time() + timeout_s
+        end_s = asyncio.get_running_loop().time() + timeout_s
         with self.watch() as changed:
             while not task.state.is_final and not self.is_closing:
                 changed.clear()
                 if task.state.is_final:
                     break
                 try:
-                    await asyncio.wait_for(changed.wait(), end_s - loop.time())
+                    async with asyncio.timeout_at(end_s):
+                        await changed.wait()
                 except TimeoutError:
                     break
         return task.state.is_final

@@ -112,7 +112,8 @@ async def stream(socket: WebSocket) -> None:
 async def _by_first_message(socket: WebSocket, state: AppState) -> Caller | None:
     """Return whose key a listener's first message has, `{"key": "..."}`; close the socket and return None without one."""
     try:
-        message = await asyncio.wait_for(socket.receive_json(), FIRST_MESSAGE_S)
+        async with asyncio.timeout(FIRST_MESSAGE_S):
+            message = await socket.receive_json()
         secret = message.get("key") if isinstance(message, dict) else None
         caller = caller_with(state.service.keys.now(), secret if isinstance(secret, str) else "")
         check_role(caller, Role.OBSERVER)

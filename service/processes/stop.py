@@ -64,13 +64,15 @@ class StopServer:
         if len(self._open) > MAX_CONNECTIONS:
             self._make_room(writer)
         try:
-            line = await asyncio.wait_for(reader.readuntil(b"\n"), HEAD_TIMEOUT_S)
+            async with asyncio.timeout(HEAD_TIMEOUT_S):
+                line = await reader.readuntil(b"\n")
             peer = writer.get_extra_info("peername")
             state = self.begin(line, str(peer[0]) if isinstance(peer, tuple) else "local")
             self._open[writer] = state is not None
             answer = self.answer(line + await _rest(reader), state, is_recorded=await self._is_recorded(state))
             writer.write(answer)
-            await asyncio.wait_for(writer.drain(), HEAD_TIMEOUT_S)
+            async with asyncio.timeout(HEAD_TIMEOUT_S):
+                await writer.drain()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # a slow or broken client gets no answer and does not delay others
         finally:

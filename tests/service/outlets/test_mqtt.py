@@ -17,6 +17,7 @@ import aiomqtt
 import pytest
 
 from hal.outlets import MqttSection
+from service.outlets.broker import BrokerClient
 from service.outlets.mqtt import MqttOutlet
 from service.outlets.source import CursorFile
 from tests.service.outlets.fakes import FakeSource, no_pause
@@ -72,7 +73,7 @@ class Plant:
     async def run(self) -> None:
         while True:
             try:
-                async with aiomqtt.Client("127.0.0.1", self._broker.port) as client:
+                async with BrokerClient("127.0.0.1", self._broker.port) as client:
                     await client.subscribe("panelwright/#", qos=1)
                     self.connected.set()
                     async for message in client.messages:
@@ -158,6 +159,26 @@ def test_a_broker_that_is_away_for_a_day_loses_doubles_and_reorders_nothing(brok
         assert unique == sorted(unique)
         assert set(range(max(unique) - 478, max(unique) + 1)) <= set(unique)
         assert max(unique) == 481
+
+    asyncio.run(story())
+
+
+def test_a_cancellation_that_comes_together_with_the_brokers_answer_is_not_lost(broker: Broker) -> None:
+    async def story() -> None:
+        publishing: asyncio.Task[None]
+
+        class Client(BrokerClient):
+            def _on_publish(self, *args: Any) -> None:
+                super()._on_publish(*args)
+                publishing.cancel()
+
+        plant = Plant(broker)
+        async with at_once(plant.run()):
+            await until(plant.connected.is_set)  # the broker has started
+            async with Client("127.0.0.1", broker.port) as client:
+                publishing = asyncio.ensure_future(client.publish("topic", "text", qos=1))
+                await asyncio.wait({publishing}, timeout=30.0)
+        assert publishing.cancelled()
 
     asyncio.run(story())
 

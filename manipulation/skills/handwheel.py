@@ -215,12 +215,11 @@ def _turn_once(
     except SkillFailure:
         belief.failed.add(hold)
         raise
-    turn.free_rad = free_turn_rad(wheel, where, sign)
+    turn.free_rad, turn.ran_nm = free_turn_rad(wheel, where, sign), belief.ran_nm
     try:
         turn.turn(part_rad)
         _note(where, turn, sign, belief.lost_rad)
-        belief.felt(turn.felt_nm)
-        belief.effort_nm = turn.felt_nm
+        belief.ran_at(turn.felt_nm)
         belief.turned(hold, angle_rad, where.known)
     except SkillFailure as failure:
         _note(where, turn, sign, belief.lost_rad)

@@ -18,6 +18,7 @@ FLAT_RATIO = 0.3  # of the steepest slope: below it the object moves
 LEAST_NM = 0.06  # above noise, drift and the hand's own inertia
 SLIP_RATIO = 0.5
 SLIDING_RATIO, STEEP_RATIO = 0.5, 0.5  # see `_breakaway`
+LIGHTER_RATIO, SEATING_RAD = 0.75, 0.2  # see `_breakaway`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,8 +51,12 @@ class Felt:
         return float(self.torque_nm.max())
 
 
-def felt_in(before: Felt, turned_rad: Array, torque_nm: Array) -> Felt:
-    """Return what was felt in a hold after one more motion of it."""
+def felt_in(before: Felt, turned_rad: Array, torque_nm: Array, *, ran_nm: float = 0.0) -> Felt:
+    """Return what was felt in a hold after one more motion of it.
+
+    Args:
+        ran_nm: torque at which the object turned in an earlier hold; 0 where it has not.
+    """
     turned = np.concatenate([before.turned_rad, turned_rad])
     torque = np.concatenate([before.torque_nm, torque_nm])
     ahead = np.maximum.accumulate(turned)
@@ -63,7 +68,7 @@ def felt_in(before: Felt, turned_rad: Array, torque_nm: Array) -> Felt:
     level = np.interp(grid, ahead[order] + 1e-9 * np.arange(len(order)), torque[order])
     level = np.array([np.median(level[max(0, k - 1) : k + 2]) for k in range(len(level))])
     slopes = (level[WINDOW:] - level[:-WINDOW]) / (WINDOW * STEP_RAD)
-    gives = _breakaway(level, slopes)
+    gives = _breakaway(level, slopes, LIGHTER_RATIO * ran_nm)
     end_nm = float(np.median(torque[-5:]))
     if gives is None:
         return Felt(turned_rad=turned, torque_nm=torque, has_slipped=end_nm < SLIP_RATIO * level.max() - LEAST_NM)
@@ -93,11 +98,12 @@ def _wound_up(grid: Array, level_nm: Array, gives: int, end_nm: float, slope: fl
     return float(grid[k - 1] + np.clip(share, 0.0, 1.0) * (grid[k] - grid[k - 1]))
 
 
-def _breakaway(level_nm: Array, slopes: Array) -> int | None:
+def _breakaway(level_nm: Array, slopes: Array, expected_nm: float) -> int | None:
     """Return the index at which a rising torque (N,) becomes flat; None when it does not.
 
     A torque that is flat and then rises steeply to a flat one of more than twice its size was a finger that slid, before
-    both pushed: the object gives way at the second.
+    both pushed: the object gives way at the second. So was a flat torque below `expected_nm`, with which the object has
+    turned before, unless it stays flat for `SEATING_RAD`.
     """
     found: int | None = None
     for k in range(1, len(slopes)):
@@ -105,8 +111,12 @@ def _breakaway(level_nm: Array, slopes: Array) -> int | None:
         is_flat = level_nm[k] > LEAST_NM and steepest > 0.5 and slopes[k] < FLAT_RATIO * steepest
         if not is_flat:
             continue
-        if found is None or (
-            level_nm[found] < SLIDING_RATIO * level_nm[k] and slopes[found:k].max() >= STEEP_RATIO * steepest
+        if (
+            found is None
+            or level_nm[found] < expected_nm <= level_nm[k]
+            or (level_nm[found] < SLIDING_RATIO * level_nm[k] and slopes[found:k].max() >= STEEP_RATIO * steepest)
         ):
             found = k
+    if found is not None and level_nm[found] < expected_nm and (len(level_nm) - found) * STEP_RAD < SEATING_RAD:
+        return None
     return found

@@ -41,6 +41,7 @@ class Belief:
     Attributes:
         effort_nm: torque that moves the wheel, or the largest that did not.
         failed: holds that were tried in vain.
+        ran_nm: torque at which the wheel turned in an earlier hold; 0 before.
         tried_nm: largest torque that was put on the wheel.
         has_slipped: whether the pads slipped in a hold, so that the torque at which the wheel gives way is not known.
         least_arm_m: how far from the hub the spokes must be pushed, because nearer to it did not do.
@@ -49,6 +50,7 @@ class Belief:
 
     effort_nm: float
     failed: set[Hold] = field(default_factory=set)
+    ran_nm: float = 0.0
     tried_nm: float = 0.0
     has_slipped: bool = False
     least_arm_m: float = 0.0
@@ -74,6 +76,15 @@ class Belief:
     def felt(self, torque_nm: float) -> None:
         """Note a torque that was put on the wheel."""
         self.tried_nm = max(self.tried_nm, torque_nm)
+
+    def ran_at(self, torque_nm: float) -> None:
+        """Note the torque at which the wheel turned, which the first time replaces what the panel file states.
+
+        Later only a larger one counts: a short turn, in which pads and arm bend more than the wheel turns, shows too little.
+        """
+        self.effort_nm = max(self.effort_nm, torque_nm) if self.ran_nm else torque_nm
+        self.ran_nm = max(self.ran_nm, torque_nm)
+        self.felt(torque_nm)
 
     def turned(self, hold: Hold, begun_rad: float, expected_rad: float) -> None:
         """Note that a hold has turned the wheel, by what the fingers felt."""

@@ -59,6 +59,7 @@ class WheelTurn:
         is_across: whether the whole wheel is between the fingers, so that its hub is midway between them.
         side_per_nm: force along the line of the fingers for each N m, with which spokes that are not opposite push.
         free_rad: turn in which no end stop can be met; 0 where that is not known.
+        ran_nm: torque at which the wheel turned in an earlier hold; 0 where it has not.
         moved_rad: how far the wheel has turned, not negative.
     """
 
@@ -73,6 +74,7 @@ class WheelTurn:
     side_per_nm: float = 0.0
     is_across: bool = False
     free_rad: float = 0.0
+    ran_nm: float = 0.0
     moved_rad: float = 0.0
     _felt: Felt = field(default_factory=Felt)
     _side_n: float = 0.0
@@ -107,7 +109,7 @@ class WheelTurn:
             report = self._turn_on(goal_rad)
             x_n, torque_nm = np.median(report.log.wrench[-SIDE_SAMPLES:][:, [0, 5]], axis=0)
             self._side_n = float(np.sign(x_n) * self.side_per_nm * max(0.0, -self.sign * torque_nm))
-            felt = self._felt = felt_in(self._felt, *self._log(report))
+            felt = self._felt = felt_in(self._felt, *self._log(report), ran_nm=self.ran_nm)
             self.moved_rad = felt.moved_rad
             if report.tripped == "slip" or felt.has_slipped:
                 raise SkillFailure(Outcome.SLIPPED, f"the fingers slipped at {felt.peak_nm:.1f} N m")

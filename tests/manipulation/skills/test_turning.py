@@ -39,6 +39,23 @@ def test_a_finger_that_slides_before_both_push_is_not_the_object_that_gives_way(
     assert felt.moved_rad == pytest.approx(5.0 - FREE_RAD - 2.4 / 9.0, abs=0.1)
 
 
+@pytest.mark.parametrize("end_rad", [0.3, 0.42, 0.5, 1.0])
+def test_pads_that_settle_are_not_an_object_that_has_turned_with_more_before(end_rad: float) -> None:
+    """The torque of pads that settle falls from 1.5 to 1.1 N m; the object gives way at 2.4 N m, after 0.42 rad."""
+    turned = np.arange(0.0, end_rad, 0.002)
+    torque = np.interp(turned, [0.2, 0.26, 0.32, 0.42], [0.0, 1.5, 1.1, 2.4])
+    felt = felt_in(Felt(), turned, torque, ran_nm=2.4)
+    assert felt.is_moving == (end_rad > 0.42)
+    assert felt.moved_rad == pytest.approx(max(0.0, end_rad - 0.42), abs=0.04)
+
+
+def test_an_object_that_has_become_lighter_is_felt_to_turn_after_a_while() -> None:
+    turned = np.arange(0.0, 1.0, 0.002)
+    felt = felt_in(Felt(), turned, torques(turned, friction_nm=0.6, pads_nm_per_rad=9.0), ran_nm=2.4)
+    assert felt.running_nm == pytest.approx(0.6, rel=0.05)
+    assert felt.moved_rad == pytest.approx(1.0 - FREE_RAD - 0.6 / 9.0, abs=0.05)
+
+
 def test_an_object_that_only_loads_the_pads_has_not_moved() -> None:
     turned = np.linspace(0.0, 0.9, 300)
     felt = felt_in(Felt(), turned, torques(turned, friction_nm=9.0, pads_nm_per_rad=3.0))

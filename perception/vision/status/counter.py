@@ -7,6 +7,7 @@ the drums, for every height at which the row of digits may lie.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -235,13 +236,13 @@ def _rows_of(scores: Float32) -> Float32:
 def _drawings(columns: int) -> Float32:
     """Return (variants, turned, 10, pixels) drums as they look in a cell of so many columns, without mean and of unit length."""
     tall_px = [height * ROWS / CELL_HEIGHT for height in HEIGHTS]
-    variants = []
+    strips = []
     for font, stroke, tall, narrowed in product(FONTS, STROKES, tall_px, NARROWED):
         sharp = [_drawn(digit, font, tall, stroke, narrowed, columns) for digit in range(10)]
-        for blur in BLURS_PX:
-            digits = [np.asarray(cv2.GaussianBlur(digit, (0, 0), blur), np.float32) for digit in sharp]
-            variants.append([[_turned(digits, digit, share) for digit in range(10)] for share in TURNED])
-    return _unit(np.array(variants, np.float32).reshape(len(variants), len(TURNED), 10, ROWS * columns))
+        strips += [[cv2.GaussianBlur(digit, (0, 0), blur) for digit in sharp] for blur in BLURS_PX]
+    digits = np.array(strips, np.float32)
+    drums = np.stack([_turned(digits, share) for share in TURNED], axis=1)
+    return _unit(drums.reshape(*drums.shape[:3], ROWS * columns))
 
 
 def _drawn(digit: int, font: str | int, height_px: float, stroke: float, narrowed: float, columns: int) -> Float32:
@@ -263,16 +264,19 @@ def _drawn(digit: int, font: str | int, height_px: float, stroke: float, narrowe
     return np.asarray(cv2.resize(moved, (columns, 3 * ROWS), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _turned(digits: list[Float32], digit: int, share: float) -> Float32:
-    """Draw a drum on the way from a digit to the next, which comes up from below."""
+def _turned(digits: Float32, share: float) -> Float32:
+    """Return drums on the way from each of (variants, 10, 3 ROWS, columns) digits to the next, which comes up from below."""
     pitch = DRUM_PITCH * ROWS / CELL_HEIGHT
-    up = share * pitch
-    return np.asarray(_window(digits[digit], up) + _window(digits[(digit + 1) % 10], up - pitch), np.float32)
+    return _window(digits, share * pitch) + _window(np.roll(digits, -1, axis=1), (share - 1.0) * pitch)
 
 
-def _window(strip: Float32, up_px: float) -> Float32:
-    move = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -ROWS - up_px]])
-    return np.asarray(cv2.warpAffine(strip, move, (strip.shape[1], ROWS)), np.float32)
+def _window(strips: Float32, up_px: float) -> Float32:
+    """Return the `ROWS` in the middle of (variants, 10, 3 ROWS, columns) strips that were moved up, interpolated linearly."""
+    whole = math.floor(up_px)
+    part = np.float32(up_px - whole)
+    padded = np.pad(strips, ((0, 0), (0, 0), (ROWS, ROWS), (0, 0)))
+    upper, lower = (padded[:, :, first : first + ROWS] for first in (2 * ROWS + whole, 2 * ROWS + whole + 1))
+    return np.asarray((1.0 - part) * upper + part * lower, np.float32)
 
 
 def _unit(rows: Float32) -> Float32:

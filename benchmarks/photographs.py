@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.display_drawing import PHOTOGRAPHS, draw_photograph
 from benchmarks.vision_dials import DrawnDial, draw_dial
-from benchmarks.vision_manometers import USUAL, Way, draw_manometer
+from benchmarks.vision_manometers import USUAL, Print, Way, draw_manometer
 from hal.arrays import Image
 from hal.errors import CellError
 from perception.vision import decode, read_photograph
@@ -31,9 +31,12 @@ REAL = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "visi
 SEED, COUNT = 200000, 60
 SURE = 0.8
 METER_NUMERAL = 0.007  # see `draw_dial`
+PRINTED = ("DejaVuSans", "DejaVuSans-Bold", "cmss10", "STIXGeneral", "DejaVuSansMono", "cmb10", "DejaVuSerif")
+FACE_SHARE, LEGIBLE_PX = 0.4, 8.0  # of a face's radius in a picture's side; height of numerals that can be read
 DIAL_WITHIN, GAUGE_WITHIN = 0.02, 0.025  # of the scale
 PASS = {
-    "dials": 0.93, "manometers": 0.95, "counters": 0.40, "told the ends": 0.95, "told the scale": 0.85, "two pointers": 0.80,
+    "dials": 0.93, "manometers": 0.95, "counters": 0.40, "told nothing": 0.60, "told the ends": 0.95,
+    "told the scale": 0.85, "two pointers": 0.80,
     "cropped": 0.90, "scene": 0.70, "low contrast": 0.40, "minus": 0.70,
 }  # fmt: skip
 
@@ -148,6 +151,26 @@ def _drawn_gauges(seeds: range, way_of: Callable[[int], Way], *, ends: bool, sca
         yield Case(image=drawn.image, read=partial(_gauge, **given), truth=truth, within=10 * GAUGE_WITHIN)
 
 
+def printed_way(seed: int) -> Way:
+    """Return a usual sweep with numerals of a font of matplotlib, the same for the same seed; a third point outwards."""
+    rng = np.random.default_rng((seed, 7))
+    how = Print(
+        font=str(rng.choice(PRINTED)), height=float(rng.uniform(0.08, 0.14)), is_radial=bool(rng.random() < 0.35)
+    )
+    return Way(print=how)
+
+
+def _untold_gauges(seeds: range) -> Iterator[Case]:
+    """Yield drawn gauges of which nothing is told, and whose numerals have `LEGIBLE_PX` at least."""
+    for seed in seeds:
+        way = printed_way(seed)
+        drawn = draw_manometer(seed, way)
+        if way.print is not None and way.print.height * FACE_SHARE * min(drawn.image.shape[:2]) >= LEGIBLE_PX:
+            yield Case(
+                image=drawn.image, read=_gauge, truth=drawn.reading / 10 * drawn.full, within=GAUGE_WITHIN * drawn.full
+            )
+
+
 def any_way(seed: int) -> Way:
     """Return a sweep of 40 to 340 degrees, turned by up to 20 degrees, the same for the same seed."""
     rng = np.random.default_rng((seed, 5))
@@ -179,6 +202,7 @@ def drawn_sets(first: int, count: int) -> Iterator[tuple[str, float, Iterable[Ca
     usual = partial(_always, USUAL)
     red = partial(_always, Way(has_red=True))
     falling = partial(_always, Way(falls=True))
+    yield "drawn: gauges, told nothing", PASS["told nothing"], _untold_gauges(range(first, first + 2 * count))
     yield "drawn: gauges, told the scale", PASS["told the scale"], _drawn_gauges(seeds, usual, ends=False)
     yield "drawn: gauges, told the ends", PASS["told the ends"], _drawn_gauges(seeds, usual, ends=True)
     yield "drawn: 40 to 340 deg, turned, scale", 0.0, _drawn_gauges(seeds, any_way, ends=False)

@@ -30,7 +30,7 @@ Rng = np.random.Generator
 class DrawnDial:
     """Image (H, W, 3) uint8 of a dial from 0 to 10, its reading, and whether its scale is a full turn from the top.
 
-    `red` is the reading of a second, red pointer, or None if there is none.
+    `red` is the reading of a second, red pointer, or None if there is none; `full` is the largest value of a gauge's numerals.
     """
 
     image: Image
@@ -38,6 +38,7 @@ class DrawnDial:
     circular: bool
     shape: str
     red: float | None = None
+    full: float = 10.0
 
 
 def draw_dial(seed: int, *, falls: bool = False, circular: bool | None = None, numeral: float = 0.0022) -> DrawnDial:

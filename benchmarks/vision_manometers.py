@@ -8,10 +8,14 @@ tested on seeds 70000 to 70320, 71000 to 71099 and 84000 to 84199.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib import get_data_path
 from numpy.typing import NDArray
+from PIL import Image as Pillow
+from PIL import ImageDraw, ImageFont
 
 from benchmarks.vision_dials import CANVAS_PX, SPAN_RAD, Colour, DrawnDial, Pen, Rng, seen_aslant
 from hal.arrays import Image
@@ -25,11 +29,22 @@ WORDS = ("bar", "psi", "kPa", "kg/cm2", "MPa", "PRESSURE", "CL 1.6", "EN 837-1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Print:
+    """Numerals as large as on most gauges: a font of matplotlib, the height over the radius, whether tops point outwards."""
+
+    font: str
+    height: float
+    is_radial: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
     """Sweep of a pointer: its angle, the clockwise rotation of the whole gauge, whether the numerals run
     counter-clockwise, and whether a red pointer for the maximum, or for a set value, stands beside the black one.
+    Without a print the numerals are small.
     """
 
+    print: Print | None = None
     span_rad: float = SPAN_RAD
     turned_rad: float = 0.0
     falls: bool = False
@@ -60,7 +75,7 @@ def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
     pen = _mounted(rng)
     level = int(rng.integers(215, 250))
     pen.disc(0.0, (0.0, 0.0), 1.0, (level, level, level - int(rng.integers(0, 15))))
-    _face(pen, rng, way)
+    full = _face(pen, rng, way)
     red = _second_share(rng, share) if way.has_red else None
     if red is not None:
         _red_pointer(pen, rng, way.angle_rad(red))
@@ -71,6 +86,7 @@ def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
         circular=False,
         shape=shape,
         red=None if red is None else 10 * red,
+        full=full,
     )
 
 
@@ -109,14 +125,16 @@ def _mounted(rng: Rng) -> Pen:
     return pen
 
 
-def _face(pen: Pen, rng: Rng, way: Way) -> None:
+def _face(pen: Pen, rng: Rng, way: Way) -> float:
+    """Draw scales, words and screws; returns the largest value of the outer scale."""
     full, steps = float(rng.choice(FULL_SCALES)), int(rng.choice((4, 5, 6, 8, 10)))
     outer = float(rng.uniform(0.88, 0.96))
     ink = INKS[int(rng.integers(len(INKS)))]
     if rng.random() < 0.5:
         first = float(rng.uniform(0.5, 0.9))
         band = (200, 40, 45) if rng.random() < 0.7 else (60, 150, 60)
-        _arc(pen, way, float(rng.uniform(0.70, 0.95)), (first, 1.0), band, float(rng.uniform(0.02, 0.06)))
+        band_at = float(rng.uniform(0.70, 0.95)) if way.print is None else outer + float(rng.uniform(-0.05, 0.0))
+        _arc(pen, way, band_at, (first, 1.0), band, float(rng.uniform(0.02, 0.06)))
     _ring(pen, rng, way, full, steps, outer, ink)
     if rng.random() < 0.5:
         second = INKS[int(rng.integers(len(INKS)))]
@@ -144,20 +162,52 @@ def _face(pen: Pen, rng: Rng, way: Way) -> None:
                 cv2.LINE_AA,
                 4,
             )
+    return full
 
 
 def _ring(pen: Pen, rng: Rng, way: Way, full: float, steps: int, outer: float, ink: Colour) -> None:
     """Draw a scale of ticks that end at the radius `outer`, with numerals inside."""
     minor, size = int(rng.choice((2, 4, 5, 10))), float(rng.uniform(0.0014, 0.0024))
-    for k in range(steps * minor + 1):
-        turn = way.angle_rad(k / (steps * minor))
+    step = full / steps if way.print is None else _usual_step(full, steps)
+    for k in range(int(full / step * minor + 1e-9) + 1):
+        value = k * step / minor
+        turn = way.angle_rad(value / full)
         long, half = (0.09, 0.009) if k % minor == 0 else (0.05, 0.004)
         pen.fill(turn, [(outer - long, -half), (outer - long, half), (outer, half), (outer, -half)], ink)
-        if k % minor == 0:
-            at = (outer - 0.19) * np.array([np.cos(turn), np.sin(turn)])
-            _write(pen, f"{full * k / (steps * minor):g}", (float(at[0]), float(at[1])), size, ink)
+        if k % minor:
+            continue
+        if way.print is not None:
+            _print(pen, way.print, f"{value:g}", turn, outer, ink)
+            continue
+        at = (outer - 0.19) * np.array([np.cos(turn), np.sin(turn)])
+        _write(pen, f"{value:g}", (float(at[0]), float(at[1])), size, ink)
     if rng.random() < 0.5:
         _arc(pen, way, outer, (0.0, 1.0), ink, 0.008)
+
+
+def _usual_step(full: float, wanted: int) -> float:
+    """Return the step of a usual scale whose number of steps is nearest to the wanted one, with all of its numbers told."""
+    steps = [mantissa * 10.0**power for power in range(-2, 4) for mantissa in (1.0, 2.0, 2.5, 5.0)]
+    return min((step for step in steps if 3.9 < full / step < 12.0), key=lambda step: abs(full / step - wanted))
+
+
+def _print(pen: Pen, how: Print, text: str, turn: float, outer: float, ink: Colour) -> None:
+    """Write a number inside of its tick."""
+    tall = how.height * pen.radius
+    font = ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / f"{how.font}.ttf"), tall / 0.72)
+    left, top, right, bottom = font.getbbox(text)
+    side = 2 * int(np.ceil(0.6 * np.hypot(right - left, bottom - top))) + 2
+    stamp = Pillow.new("L", (side, side))
+    ImageDraw.Draw(stamp).text(((side - left - right) / 2, (side - top - bottom) / 2), text, fill=255, font=font)
+    if how.is_radial:
+        stamp = stamp.rotate(-np.rad2deg(turn), Pillow.Resampling.BICUBIC)
+    half = 0.5 * np.array([bottom - top, right - left]) / pen.radius
+    reach = half[0] if how.is_radial else float(np.hypot(half[0] * np.cos(turn), half[1] * np.sin(turn)))
+    at = outer - 0.13 - reach
+    x, y = (place // 16 - side // 2 for place in pen.place(turn, (at, 0.0)))
+    share = np.asarray(stamp, float)[:, :, None] / 255
+    under = pen.canvas[y : y + side, x : x + side]
+    pen.canvas[y : y + side, x : x + side] = (under * (1 - share) + share * np.array(ink)).astype(np.uint8)
 
 
 def _arc(pen: Pen, way: Way, at: float, shares: tuple[float, float], colour: Colour, width: float) -> None:

@@ -86,10 +86,26 @@ class SeenPointer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SeenScale:
+    """The scale by which a gauge was read: its end values, and the pointer's angles there, rad clockwise from up."""
+
+    minimum: float
+    maximum: float
+    at_min_rad: float
+    at_max_rad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PatchReading(Answer):
-    """Reading of the object in a patch; `pointers` are those of a gauge that has more than one."""
+    """Reading of the object in a patch.
+
+    Attributes:
+        pointers: those of a gauge that has more than one.
+        scale: of a gauge in a photograph, what was taken for its scale.
+    """
 
     pointers: tuple[SeenPointer, ...] = ()
+    scale: SeenScale | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -44,7 +44,10 @@ def read(
         ),
     ],
     scale: Annotated[
-        str | None, typer.Option(help="Values at the ends of the scale, clockwise, e.g. 0..10, or 10..0.")
+        str | None,
+        typer.Option(
+            help="Values at the ends of the scale, clockwise, e.g. 0..10, or 10..0; a gauge's numerals tell them if not given."
+        ),
     ] = None,
     ends: Annotated[
         str | None,
@@ -62,7 +65,7 @@ def read(
     ] = 0.5,
     json: Annotated[bool, typer.Option("--json", help="Print the whole answer as JSON.")] = False,
 ) -> None:
-    """Read one gauge, dial or display in a photograph, of which only the kind and the scale are known.
+    """Read one gauge, dial or display in a photograph, of which only the kind is known, and perhaps the scale.
 
     The exit code is 1 when the instrument cannot be read.
     """
@@ -91,7 +94,8 @@ def _said(found: PhotographReading) -> str:
     sure = f"confidence {found.confidence:.2f}"
     if found.text is not None:
         return f"{found.text} {found.unit}".strip() + f"  ({sure})"
-    return f"{found.value:.4g} {found.unit}".strip() + f"  (one sigma {found.uncertainty:.2g}, {sure})"
+    by = "" if found.scale is None else f", on a scale from {found.scale.minimum:g} to {found.scale.maximum:g}"
+    return f"{found.value:.4g} {found.unit}".strip() + f"  (one sigma {found.uncertainty:.2g}, {sure}{by})"
 
 
 def _span(text: str | None, option: str) -> tuple[float, float] | None:

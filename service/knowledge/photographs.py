@@ -1,4 +1,4 @@
-"""Reads instruments in users' photographs from their kind and scale, without teaching."""
+"""Reads instruments in users' photographs from their kind, and their scale if it is told, without teaching."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.schema.results import PhotographGuess, PhotographPointer, PhotographReading
+from service.schema.results import PhotographGuess, PhotographPointer, PhotographReading, PhotographScale
 
 if TYPE_CHECKING:
     from perception.vision import PhotographKind
@@ -64,4 +64,5 @@ def read_pixels(
         reason=found.reason,
         guess=None if guess is None else PhotographGuess.model_validate(guess),
         pointers=tuple(PhotographPointer.model_validate(seen) for seen in found.pointers),
+        scale=None if found.scale is None else PhotographScale.model_validate(found.scale),
     )

@@ -275,17 +275,14 @@ def _feel_at(session: Session, spot: Array, monitor: plausibility.ProximityMonit
         if finding is not None:
             raise finding.error()
     base_from_grip = touched.report.base_from_tool
-    normal_sigma = float(np.sqrt(touched.normal @ touched.covariance @ touched.normal))
-    observations.append(
-        TouchObservation(
-            sensor=session.first(DeviceKind.GRIPPER),
-            base_from_flange=base_from_grip * context.flange_from_grip.inv(),
-            tip_m=base_from_grip.inv().apply(touched.point_m),
-            sigma_m=normal_sigma,
-            label=f"touch at ({spot[0]:.3f}, {spot[1]:.3f})",
-        )
+    touch = TouchObservation(
+        sensor=session.first(DeviceKind.GRIPPER),
+        base_from_flange=base_from_grip * context.flange_from_grip.inv(),
+        tip_m=base_from_grip.inv().apply(touched.point_m),
+        sigma_m=float(np.sqrt(touched.normal @ touched.covariance @ touched.normal)),
+        label=f"touch at ({spot[0]:.3f}, {spot[1]:.3f})",
     )
-    return observations
+    return [*observations, touch]
 
 
 def _whose(names: Sequence[str], mounts: Sequence[Any], flange: Any, base_from_sensor: Any) -> str:

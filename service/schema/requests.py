@@ -218,7 +218,7 @@ class EvaluateRequest(Strict):
 
 
 class ReadPhotographRequest(Strict):
-    """Read one instrument in a stored photograph, of which only the kind and the scale are known."""
+    """Read one instrument in a stored photograph, of which only the kind is known, and perhaps the scale."""
 
     image: Annotated[ImageId, Field(description="id of a stored image (POST /v1/images)")]
     kind: Annotated[
@@ -230,7 +230,8 @@ class ReadPhotographRequest(Strict):
     scale: Annotated[
         tuple[float, float] | None,
         Field(
-            description="values at the ends of a gauge's or dial's scale, clockwise: the greater one first if they fall"
+            description="values at the ends of a gauge's or dial's scale, clockwise: the greater one first if they fall; "
+            "null: a gauge's numerals tell them"
         ),
     ] = None
     ends_rad: Annotated[

@@ -275,6 +275,15 @@ class PhotographPointer(Result):
     value: Annotated[float, Field(description="where it points, in `unit`")]
 
 
+class PhotographScale(Result):
+    """What was taken for the scale of a gauge in a photograph."""
+
+    minimum: float
+    maximum: float
+    at_min_rad: Annotated[float, Field(description="pointer angle at the minimum, clockwise from up")]
+    at_max_rad: Annotated[float, Field(description="pointer angle at the maximum, clockwise from up")]
+
+
 class PhotographReading(Result):
     """The reading of an instrument in a photograph, or the reason why it cannot be read.
 
@@ -293,3 +302,6 @@ class PhotographReading(Result):
     pointers: Annotated[
         tuple[PhotographPointer, ...], Field(description="the pointers of a gauge that has more than one; else empty")
     ] = ()
+    scale: Annotated[
+        PhotographScale | None, Field(description="what was taken for a gauge's scale; null for other kinds")
+    ] = None

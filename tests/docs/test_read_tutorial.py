@@ -32,5 +32,6 @@ def test_the_python_code_reads_both_pointers(monkeypatch: pytest.MonkeyPatch) ->
     found = run(PAGE)["found"]
     assert "two pointers" in found.reason
     values = {pointer.colour: pointer.value for pointer in found.pointers}
-    assert values["black"] == pytest.approx(185.2, abs=1.0)
-    assert values["red"] == pytest.approx(150.4, abs=1.0)
+    assert values["black"] == pytest.approx(162.4, abs=1.0)
+    assert values["red"] == pytest.approx(106.4, abs=1.0)
+    assert (found.scale.minimum, found.scale.maximum) == (0.0, 200.0)

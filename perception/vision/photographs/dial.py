@@ -1,13 +1,14 @@
-"""Reader of one dial that fills a photograph of a meter or gauge; nothing is taught but the ends of its scale.
+"""Reader of one dial that fills a photograph of a meter or gauge; nothing is taught, and at most its scale is told.
 
-The search for its pointers is in `hands`, that for the ends of its scale in `scale_ends`.
+The search for its pointers is in `hands`, that for the ends of its scale in `scale_ends`, and that for the scale itself, by its
+numerals, in `numerals` and `numeral_scale`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -21,8 +22,20 @@ from perception.vision.image import as_gray
 from perception.vision.photographs.dial_outline import SIDE_PX, dial_circle
 from perception.vision.photographs.hands import Pointer, confidence_of, find_hands
 from perception.vision.photographs.numeral_direction import numerals_run
+from perception.vision.photographs.numeral_scale import printed_scales
+from perception.vision.photographs.numerals import find_numbers
 from perception.vision.photographs.scale_ends import scale_ends
-from perception.vision.reading import ANSWER_AT, PatchReading, SeenPointer, answer_at, doubted, gated, limited, refused
+from perception.vision.reading import (
+    ANSWER_AT,
+    PatchReading,
+    SeenPointer,
+    SeenScale,
+    answer_at,
+    doubted,
+    gated,
+    limited,
+    refused,
+)
 from perception.vision.status.gauge import status_of_pointer
 from perception.vision.status.pointer import PointerFit
 
@@ -37,6 +50,7 @@ BY_NUMERALS = 0.75  # largest confidence if the numerals run against what was to
 # more than 2.5 % of it.
 NARROW, NARROW_RAD = 0.75, np.deg2rad(75.0)
 RED_UNASKED = 0.75  # largest confidence of a gauge's red pointer that nobody asked for: it may be that of a limit
+NO_SCALE = "the numerals do not tell the scale: come closer, or give the values at its ends, for example 0 to 10"
 BY_TICKS = (
     0.75  # largest confidence if the ends are not told: one may be off by a tick, or the values may fall clockwise
 )
@@ -62,31 +76,90 @@ def read_dial(
         InvalidRequest, NotObservable: bad image.
     """
     picture, circle = _at_reading_size(image)
+    scale = partial(_scale_of, as_gray(picture), circle, (minimum, maximum), ends_rad, circular=circular)
+    red_most = 1.0 if circular else RED_UNASKED
+    return _read(picture, circle, scale, pointer, red_most=red_most, least_confidence=least_confidence)
+
+
+def read_by_numerals(
+    image: NDArray[Any], *, pointer: Pointer | None = None, least_confidence: float = ANSWER_AT
+) -> PatchReading:
+    """Read the gauge that fills the picture by the scale that its numerals tell; arguments and errors as of `read_dial`.
+
+    Of several scales the outer one is read.
+    """
+    picture, circle = _at_reading_size(image)
+    scale = partial(_printed_scale, as_gray(image), max(image.shape[:2]) / SIDE_PX, circle)
+    return _read(picture, circle, scale, pointer, red_most=RED_UNASKED, least_confidence=least_confidence)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ReadScale:
+    """What reads a pointer on a scale, the largest confidence that the scale justifies, and what it is."""
+
+    status_of: Callable[[PointerFit], PatchReading]
+    most: float
+    seen: SeenScale | None = None
+
+    @staticmethod
+    def on(scale: Scale, most: float) -> _ReadScale:
+        """Return what reads a pointer on a scale over a part of a turn."""
+        return _ReadScale(
+            status_of=partial(status_of_pointer, scale=scale, seen=1.0), most=most,
+            seen=SeenScale(minimum=scale.minimum, maximum=scale.maximum, at_min_rad=scale.at_min, at_max_rad=scale.at_max),
+        )  # fmt: skip
+
+
+def _read(
+    picture: Image, circle: tuple[float, float, float], scale_of: Callable[[], _ReadScale | str], pointer: Pointer | None,
+    *, red_most: float, least_confidence: float,
+) -> PatchReading:  # fmt: skip
+    """Return the reading of the pointer, or of the one that is asked for.
+
+    Args:
+        scale_of: returns the scale, or why it cannot be.
+        red_most: largest confidence of a red pointer that nobody asked for.
+    """
     hands = find_hands(picture, circle, pointer)
     if isinstance(hands, str):
         return refused(hands)
-    scale = _scale_of(as_gray(picture), circle, (minimum, maximum), ends_rad, circular=circular)
+    scale = scale_of()
     if isinstance(scale, str):
         return refused(scale)
-    status_of, most_of_scale = scale
     seen = tuple(
         SeenPointer(colour=hand.colour, length=hand.length, value=shown.value)
         for hand in hands
-        if len(hands) > 1 and (shown := answer_at(status_of(hand.fit), 0.0)).value is not None
+        if len(hands) > 1 and (shown := answer_at(scale.status_of(hand.fit), 0.0)).value is not None
     )
-    most = min(hands[0].most, most_of_scale)
-    if hands[0].colour == "red" and pointer is None and not circular:
-        most = min(most, RED_UNASKED)
-    status = replace(limited(status_of(hands[0].fit), most), pointers=seen)
+    most = min(hands[0].most, scale.most)
+    if hands[0].colour == "red" and pointer is None:
+        most = min(most, red_most)
+    status = replace(limited(scale.status_of(hands[0].fit), most), pointers=seen, scale=scale.seen)
     if len(hands) > 1 and pointer is None:
         return doubted(status, _which_is_meant(seen))
     return answer_at(gated(status), least_confidence)
 
 
+def _printed_scale(gray: Image, ratio: float, circle: tuple[float, float, float]) -> _ReadScale | str:
+    """Return the outer one of the scales that the numerals tell.
+
+    Args:
+        gray: the picture at its own size, `ratio` times that in which the circle was found.
+    """
+    scales = printed_scales(find_numbers(gray, *(ratio * one for one in circle)))
+    if not scales:
+        return NO_SCALE
+    printed = scales[0].whole()
+    scale = Scale(
+        minimum=printed.minimum, maximum=printed.maximum, unit="", at_min=printed.at_min, at_max=printed.at_max
+    )
+    return _ReadScale.on(scale, printed.confidence)
+
+
 def _scale_of(
     gray: Image, circle: tuple[float, float, float], values: tuple[float, float], ends_rad: tuple[float, float] | None,
     *, circular: bool,
-) -> tuple[Callable[[PointerFit], PatchReading], float] | str:  # fmt: skip
+) -> _ReadScale | str:  # fmt: skip
     """Return what a pointer shows, and the largest confidence that the scale justifies; or why it cannot be the scale.
 
     Without the angles of its ends nothing says that the values rise clockwise, unless the numerals are legible.
@@ -100,12 +173,13 @@ def _scale_of(
             )
         told = first > last or run > 0
         ends = (last, first) if run < 0 and first < last else values
-        return partial(_on_full_turn, minimum=ends[0], maximum=ends[1]), 1.0 if told else BY_NUMERALS
+        status_of = partial(_on_full_turn, minimum=ends[0], maximum=ends[1])
+        return _ReadScale(status_of=status_of, most=1.0 if told else BY_NUMERALS)
     low, high = ends_rad or _ends(gray, *circle)
     at_min, at_max = (low, high) if first < last else (high, low)
     scale = Scale(minimum=min(values), maximum=max(values), unit="", at_min=at_min, at_max=at_max)
     most = BY_TICKS if ends_rad is None else NARROW if abs(high - low) < NARROW_RAD else 1.0
-    return partial(status_of_pointer, scale=scale, seen=1.0), most
+    return _ReadScale.on(scale, most)
 
 
 def _has_ten_numerals(first: float, last: float) -> bool:

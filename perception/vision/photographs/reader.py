@@ -1,4 +1,4 @@
-"""Reader of one instrument in a photograph, if only its kind and its scale are known."""
+"""Reader of one instrument in a photograph, if only its kind is known, and perhaps its scale."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hal.errors import InvalidRequest
 from perception.vision.image import check_image
-from perception.vision.photographs.dial import read_dial
+from perception.vision.photographs.dial import read_by_numerals, read_dial
 from perception.vision.photographs.hands import Pointer
 from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.reading import ANSWER_AT, PatchReading
@@ -34,7 +34,7 @@ def read_photograph(
         kind: `gauge`: a pointer over a part of a turn; `dial`: a pointer over a full turn that begins straight up, as
             in a water meter; `display`: seven-segment digits, or the drums of a counter.
         scale: values at the ends of a gauge's or a dial's scale, in the clockwise sense; the first is the greater one
-            where the values fall clockwise.
+            where the values fall clockwise. Without it a gauge is read by its numerals.
         ends_rad: pointer angles of a gauge there, clockwise from straight up. If None, they are the ends of the ticks,
             or three quarters of a turn if these are not found.
         pointer: which pointer is read where a red one stands beside another one; `black` is the one that is not red.
@@ -47,8 +47,10 @@ def read_photograph(
     """
     _check(kind, scale=scale, ends_rad=ends_rad, pointer=pointer, is_scene=is_scene)
     check_image(image)
-    if scale is None:
+    if kind == "display":
         return read_photographed_display(image, scene=is_scene, least_confidence=least_confidence)
+    if scale is None:
+        return read_by_numerals(image, pointer=pointer, least_confidence=least_confidence)
     low, high = scale
     return read_dial(
         image, minimum=low, maximum=high, circular=kind == "dial", ends_rad=ends_rad, pointer=pointer,
@@ -75,7 +77,11 @@ def _check(
     if is_scene:
         raise InvalidRequest(f"a {kind} is not looked for in a scene", hint="crop the picture to the instrument")
     if scale is None:
-        raise InvalidRequest(f"a {kind} is read by its scale", hint="give the values at its ends, for example 0 to 10")
+        if kind == "dial":
+            raise InvalidRequest("a dial is read by its scale", hint="give the values of one turn, for example 0 to 10")
+        if ends_rad is not None:
+            raise InvalidRequest("ends without a scale", hint="give the values at the ends, too, or leave both out")
+        return
     if not np.isfinite(scale).all() or scale[0] == scale[1]:
         raise InvalidRequest(
             f"a scale from {scale[0]:g} to {scale[1]:g} cannot be",

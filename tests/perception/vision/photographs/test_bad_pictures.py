@@ -50,6 +50,13 @@ def test_what_is_no_upright_instrument_is_refused_or_not_sure(name: str, kind: P
     assert (told.value is None) == bool(told.reason)
 
 
+@pytest.mark.parametrize("name", PICTURES)
+def test_what_is_no_upright_gauge_has_no_sure_scale_either(name: str) -> None:
+    told = read_photograph(PICTURES[name], "gauge")
+    assert told.confidence < SURE
+    assert (told.value is None) == bool(told.reason)
+
+
 @pytest.mark.parametrize("name", ["noise", "nothing", "two gauges", "mirrored"])
 def test_where_no_display_is_none_is_read(name: str) -> None:
     told = read(PICTURES[name], "display")

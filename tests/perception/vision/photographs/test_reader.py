@@ -37,7 +37,8 @@ def test_a_display_is_read() -> None:
 @pytest.mark.parametrize(
     ("kind", "given", "words"),
     [
-        ("gauge", {}, "by its scale"),
+        ("dial", {}, "by its scale"),
+        ("gauge", {"ends_rad": (-1.0, 1.0)}, "ends without a scale"),
         ("dial", {"scale": (1.0, 1.0)}, "cannot be"),
         ("gauge", {"scale": (0.0, np.inf)}, "cannot be"),
         ("gauge", {"scale": (10.0, 10.0)}, "cannot be"),

@@ -160,15 +160,15 @@ def printed_way(seed: int) -> Way:
     return Way(print=how)
 
 
-def _untold_gauges(seeds: range) -> Iterator[Case]:
-    """Yield drawn gauges of which nothing is told, and whose numerals have `LEGIBLE_PX` at least."""
+def _printed_gauges(seeds: range, *, scale: bool) -> Iterator[Case]:
+    """Yield drawn gauges whose numerals have `LEGIBLE_PX` at least; `scale`: whether the reader is told the scale."""
     for seed in seeds:
         way = printed_way(seed)
         drawn = draw_manometer(seed, way)
         if way.print is not None and way.print.height * FACE_SHARE * min(drawn.image.shape[:2]) >= LEGIBLE_PX:
-            yield Case(
-                image=drawn.image, read=_gauge, truth=drawn.reading / 10 * drawn.full, within=GAUGE_WITHIN * drawn.full
-            )
+            read = partial(_gauge, scale=(0.0, drawn.full)) if scale else _gauge
+            truth = drawn.reading / 10 * drawn.full
+            yield Case(image=drawn.image, read=read, truth=truth, within=GAUGE_WITHIN * drawn.full)
 
 
 def any_way(seed: int) -> Way:
@@ -202,7 +202,9 @@ def drawn_sets(first: int, count: int) -> Iterator[tuple[str, float, Iterable[Ca
     usual = partial(_always, USUAL)
     red = partial(_always, Way(has_red=True))
     falling = partial(_always, Way(falls=True))
-    yield "drawn: gauges, told nothing", PASS["told nothing"], _untold_gauges(range(first, first + 2 * count))
+    printed = range(first, first + 2 * count)
+    yield "drawn: printed gauges, told nothing", PASS["told nothing"], _printed_gauges(printed, scale=False)
+    yield "drawn: printed gauges, told the scale", PASS["told the scale"], _printed_gauges(printed, scale=True)
     yield "drawn: gauges, told the scale", PASS["told the scale"], _drawn_gauges(seeds, usual, ends=False)
     yield "drawn: gauges, told the ends", PASS["told the ends"], _drawn_gauges(seeds, usual, ends=True)
     yield "drawn: 40 to 340 deg, turned, scale", 0.0, _drawn_gauges(seeds, any_way, ends=False)

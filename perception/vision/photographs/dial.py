@@ -22,7 +22,7 @@ from perception.vision.image import as_gray
 from perception.vision.photographs.dial_outline import SIDE_PX, dial_circle
 from perception.vision.photographs.hands import Pointer, confidence_of, find_hands
 from perception.vision.photographs.numeral_direction import numerals_run
-from perception.vision.photographs.numeral_scale import printed_scales
+from perception.vision.photographs.numeral_scale import SURE, PrintedScale, printed_scales
 from perception.vision.photographs.numerals import find_numbers
 from perception.vision.photographs.scale_ends import scale_ends
 from perception.vision.reading import (
@@ -67,8 +67,8 @@ def read_dial(
         minimum, maximum: values at the ends of the scale, of which the first is left when the scale runs clockwise; a
             minimum above the maximum says that the values fall clockwise.
         circular: whether the scale is a full turn that begins straight up.
-        ends_rad: pointer angles at minimum and maximum of a scale that is not circular. If None, they are the ends of
-            the ticks, or three quarters of a turn if these are not found.
+        ends_rad: pointer angles at minimum and maximum of a scale that is not circular. If None, the numerals tell them,
+            else the ends of the ticks, or they are three quarters of a turn if these are not found.
         pointer: which one is read if there is a red one beside another one; `black` is the one that is not red.
         least_confidence: as of `inspection.inspect`.
 
@@ -76,7 +76,10 @@ def read_dial(
         InvalidRequest, NotObservable: bad image.
     """
     picture, circle = _at_reading_size(image)
-    scale = partial(_scale_of, as_gray(picture), circle, (minimum, maximum), ends_rad, circular=circular)
+    if circular or ends_rad is not None:
+        scale = partial(_scale_of, as_gray(picture), circle, (minimum, maximum), ends_rad, circular=circular)
+    else:
+        scale = partial(_told_scale, as_gray(image), as_gray(picture), circle, (minimum, maximum))
     red_most = 1.0 if circular else RED_UNASKED
     return _read(picture, circle, scale, pointer, red_most=red_most, least_confidence=least_confidence)
 
@@ -89,7 +92,7 @@ def read_by_numerals(
     Of several scales the outer one is read.
     """
     picture, circle = _at_reading_size(image)
-    scale = partial(_printed_scale, as_gray(image), max(image.shape[:2]) / SIDE_PX, circle)
+    scale = partial(_printed_scale, as_gray(image), circle)
     return _read(picture, circle, scale, pointer, red_most=RED_UNASKED, least_confidence=least_confidence)
 
 
@@ -140,13 +143,13 @@ def _read(
     return answer_at(gated(status), least_confidence)
 
 
-def _printed_scale(gray: Image, ratio: float, circle: tuple[float, float, float]) -> _ReadScale | str:
-    """Return the outer one of the scales that the numerals tell.
+def _printed_scale(gray: Image, circle: tuple[float, float, float]) -> _ReadScale | str:
+    """Return the outer one of the scales that the numerals of a picture at its own size tell.
 
     Args:
-        gray: the picture at its own size, `ratio` times that in which the circle was found.
+        circle: of the dial at the reading size.
     """
-    scales = printed_scales(find_numbers(gray, *(ratio * one for one in circle)))
+    scales = _scales_in(gray, circle)
     if not scales:
         return NO_SCALE
     printed = scales[0].whole()
@@ -154,6 +157,31 @@ def _printed_scale(gray: Image, ratio: float, circle: tuple[float, float, float]
         minimum=printed.minimum, maximum=printed.maximum, unit="", at_min=printed.at_min, at_max=printed.at_max
     )
     return _ReadScale.on(scale, printed.confidence)
+
+
+def _scales_in(gray: Image, circle: tuple[float, float, float]) -> list[PrintedScale]:
+    ratio = max(gray.shape) / SIDE_PX
+    return printed_scales(find_numbers(gray, *(ratio * one for one in circle)))
+
+
+def _told_scale(
+    gray: Image, reduced: Image, circle: tuple[float, float, float], values: tuple[float, float]
+) -> _ReadScale | str:
+    """Return a scale of which only the end values are told, with its ends by its numerals, or else by its ticks.
+
+    Args:
+        gray, reduced: the picture at its own and at the reading size.
+    """
+    low, high = min(values), max(values)
+    for printed in _scales_in(gray, circle):
+        ends_rad = printed.ends_of(low, high)
+        if ends_rad is None:
+            continue
+        if values[0] > values[1] and ends_rad[0] < ends_rad[1]:
+            return f"the numerals run clockwise, so {values[0]:g} to {values[1]:g} is not their scale: give the least value first"
+        scale = Scale(minimum=low, maximum=high, unit="", at_min=ends_rad[0], at_max=ends_rad[1])
+        return _ReadScale.on(scale, SURE if printed.is_proven_if_told else BY_TICKS)
+    return _scale_of(reduced, circle, values, None, circular=False)
 
 
 def _scale_of(

@@ -20,14 +20,15 @@ WITHIN_RAD = np.deg2rad(6.0)  # from its place; the middle of a number is not ex
 LEAST_APART_RAD = np.deg2rad(7.0)
 SPAN_RAD = np.deg2rad([30.0, 350.0])
 LEAST_NUMBERS = 3
-LONGER, LACKING = 0.7, 0.6  # weight of each further digit of a number, and cost of a number that is not found
-LEAST_WEIGHT = 3.3
+LONGER, LACKING = 0.7, 0.4  # weight of each further digit of a number, and cost of a number that is not found
+LEAST_WEIGHT = 2.7
 OFF_STEP = 1e-6  # of a step, from a whole number of steps
 MOST_STEPS = 30
 MANTISSAS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.5, 8.0)  # of the step between two numbers of a scale
 SAME_SWEEP_RAD = np.deg2rad(25.0)  # the last number of a second scale may stand before its end
 MOST_FURTHER = 4  # steps by which a scale goes on at either end beyond the numbers that were read
 UPRIGHT_RAD = np.deg2rad(5.0)  # most scales lie evenly about straight up
+LEAST_SHARE = 0.5  # of a scale that is told, which its numbers must span
 PROVEN, SURE, LIKELY = 4, 0.93, 0.75  # numbers beyond those that lack which make a scale sure, and its confidence then
 OUTER = 0.6  # of the radius: a scale further in may have an outer one, in another unit, that was not read
 
@@ -62,10 +63,23 @@ class PrintedScale:
         apart_rad = max(abs(one.at_min - two.at_min), abs(one.at_max - two.at_max))
         return abs(self.off - other.off) > SAME_RING and apart_rad < SAME_SWEEP_RAD
 
+    def ends_of(self, low: float, high: float) -> tuple[float, float] | None:
+        """Return the pointer angles at the ends of a scale that is told; None if these are not numbers of that scale."""
+        slope = (self.at_max - self.at_min) / (self.maximum - self.minimum)
+        ends_rad = self.at_min + slope * (low - self.minimum), self.at_min + slope * (high - self.minimum)
+        is_inside = low - OFF_STEP * self.step <= self.minimum and self.maximum <= high + OFF_STEP * self.step
+        is_most = self.maximum - self.minimum >= LEAST_SHARE * (high - low)
+        return ends_rad if is_inside and is_most and abs(ends_rad[1] - ends_rad[0]) < SPAN_RAD[1] else None
+
     @property
     def confidence(self) -> float:
         """Largest confidence of a reading by this scale."""
         return SURE if self.numbers - self.lacking >= PROVEN and self.off > OUTER else LIKELY
+
+    @property
+    def is_proven_if_told(self) -> bool:
+        """Whether a reading on this scale is sure where its end values are told, too."""
+        return self.numbers - self.lacking >= PROVEN - 1
 
     def whole(self) -> PrintedScale:
         """Return the scale with the ends that lie evenly about straight up, where numbers at its ends were not read."""

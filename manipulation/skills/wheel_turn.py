@@ -42,6 +42,12 @@ FREEING = Compliance(
     stiffness=(1500.0, 1500.0, 400.0, INF, INF, INF), damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0),
     mass=(100.0, 100.0, 400.0, 1.0, 1.0, 1.0), max_offset_m=MAX_OFFSET_M,
 )  # fmt: skip
+BESIDE_M = 0.003  # distance from there at which friction holds the hand
+PUSHING_FREE_N = 60.0
+PUSHING_FREE = Compliance(
+    stiffness=(8000.0, 8000.0, 400.0, INF, INF, INF), damping=(1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0),
+    mass=(100.0, 100.0, 400.0, 1.0, 1.0, 1.0), max_offset_m=MAX_OFFSET_M,
+)  # fmt: skip
 LOADING_DAMPING, LOADING_MASS = (1500.0, 1500.0, 4000.0, 10.0, 10.0, 10.0), (150.0, 150.0, 400.0, 1.0, 1.0, 1.0)
 
 
@@ -137,9 +143,15 @@ class WheelTurn:
         """Turn the hand back to where its fingers stand to the spokes as when they came down, where the way out is free.
 
         A finger that is wedged between spoke, rim and hub presses on the wheel in opposite directions. The wrist feels
-        none of it, an arm that gives way does not end it, and its friction holds the hand that moves back.
+        none of it, an arm that gives way does not end it, and its friction holds the hand that moves back. A hand that
+        friction keeps beside its place is pushed there once more, with more force.
         """
         goal = turned_about(self._start, self._start.translation, self._axis(), self.sign * self.moved_rad)
+        self._bring_to(goal, FREEING, FREEING_N)
+        if np.linalg.norm(self._tool().translation - goal.translation) > BESIDE_M:
+            self._bring_to(goal, PUSHING_FREE, PUSHING_FREE_N)
+
+    def _bring_to(self, goal: RigidTransform, compliance: Compliance, most_n: float) -> None:
         here = self._tool()
         back_rad = float((goal.rotation * here.rotation.inv()).as_rotvec() @ self._axis())
         count = 2 + int(abs(back_rad) / STEP_RAD)
@@ -151,9 +163,9 @@ class WheelTurn:
             )
             for share in shares
         ]
-        held = Guard(name="held", quantity=Quantity.FORCE, limit=FREEING_N, ticks=SIDE_TICKS)
+        held = Guard(name="held", quantity=Quantity.FORCE, limit=most_n, ticks=SIDE_TICKS)
         motion = through(
-            poses, name="stand free", speed_m_per_s=FREEING_M_PER_S, guards=(held,), compliance=FREEING,
+            poses, name="stand free", speed_m_per_s=FREEING_M_PER_S, guards=(held,), compliance=compliance,
             flange_from_tool=self.attempt.context.flange_from_grip * self._grip_from_hub,
         )  # fmt: skip
         self.attempt.run(motion)

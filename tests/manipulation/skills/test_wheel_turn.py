@@ -14,7 +14,7 @@ from hal.panel import Handwheel
 from manipulation.skills.attempt import Attempt
 from manipulation.skills.contact import relax
 from manipulation.skills.turning import Felt
-from manipulation.skills.wheel_turn import FREEING_N, WheelTurn
+from manipulation.skills.wheel_turn import FREEING_N, PUSHING_FREE_N, WheelTurn
 
 HUB_M = np.array([0.4, 0.1, 0.0])
 TIPS = RigidTransform.from_components([0.4, 0.11, 0.02], Rotation.from_euler("x", np.pi))
@@ -29,6 +29,7 @@ class Hand:
     def __init__(self) -> None:
         self.here, self.asked = TIPS, list[CartesianPath]()
         self.left_m: list[float] = []
+        self.is_wedged = False
         self.reports = [SimpleNamespace(wrench=np.array([0.0, PRESSED_N, 0.0, 0.0, 0.0, 0.0]))]
         identity = RigidTransform.identity()
         self.context = SimpleNamespace(panel_pose=identity, flange_from_grip=identity)
@@ -38,6 +39,8 @@ class Hand:
 
     def run(self, motion: CartesianPath) -> None:
         self.asked.append(motion)
+        if not self.is_wedged:
+            self.here = motion.base_from_tool[-1] * motion.base_from_tool[0].inv() * self.here
 
     def open_to(self, _width_m: float, **_: Any) -> None:
         return None
@@ -46,9 +49,18 @@ class Hand:
         self.left_m.append(distance_m)
 
 
-def let_go(turned_rad: float, moved_rad: float, sign: float, *, felt: Felt, open_m: float | None = None) -> Hand:
+def let_go(
+    turned_rad: float,
+    moved_rad: float,
+    sign: float,
+    *,
+    felt: Felt,
+    open_m: float | None = None,
+    is_wedged: bool = False,
+) -> Hand:
     """Return the hand that let go after it turned about the hub, and was pushed aside by 4 mm."""
     hand = Hand()
+    hand.is_wedged = is_wedged
     turn = WheelTurn(
         attempt=cast(Attempt, hand), wheel=cast(Handwheel, WHEEL), sign=sign, behind_rad=0.2, most_nm=2.0, up_m=UP_M,
         open_m=open_m,
@@ -76,6 +88,14 @@ def test_fingers_stand_to_the_spokes_as_when_they_came_down_before_the_hand_leav
     assert end.translation[:2] == pytest.approx(HUB_M[:2], abs=1e-9)
     assert free.guards[0].limit == FREEING_N
     assert (relax.name, hand.left_m) == ("relax", [UP_M])
+
+
+def test_a_hand_that_friction_keeps_beside_its_place_is_pushed_there_once_more() -> None:
+    _, softly, firmly = let_go(1.55, 1.2, 1.0, felt=Felt(), is_wedged=True).asked
+    assert softly.compliance is not None and firmly.compliance is not None
+    assert firmly.compliance.stiffness[0] > softly.compliance.stiffness[0]
+    assert (softly.guards[0].limit, firmly.guards[0].limit) == (FREEING_N, PUSHING_FREE_N)
+    assert firmly.base_from_tool[-1].translation[:2] == pytest.approx(HUB_M[:2], abs=1e-9)
 
 
 @pytest.mark.parametrize(("felt", "open_m"), [(Felt(has_slipped=True), None), (Felt(), 0.03)])

@@ -76,7 +76,7 @@ def test_what_cannot_be_told_is_refused_with_a_reason_and_its_guess(web: httpx2.
 @pytest.mark.parametrize(
     ("body", "status", "kind", "words"),
     [
-        ({"kind": "gauge"}, 422, "invalid-request", "by its scale"),
+        ({"kind": "dial"}, 422, "invalid-request", "by its scale"),
         ({"kind": "display", "scale": [0.0, 1.0]}, 422, "invalid-request", "no scale"),
         ({"kind": "lever"}, 422, "bad-body", "kind"),
         ({"kind": "gauge", "scale": [0.0, 1.0], "image": "0" * 24}, 404, "no-such-image", "image"),

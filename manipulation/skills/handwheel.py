@@ -155,10 +155,11 @@ def _turn_on(attempt: Attempt, wheel: Handwheel, where: InitialState, belief: Be
     try:
         span_rad = target_rad - begun_rad
         _turn_once(attempt, wheel, where, belief, hold, span_rad + np.sign(span_rad) * belief.lost_rad)
-    except Unreachable:
+    except Unreachable as failure:
         belief.failed.add(hold)
         if belief.next_hold(wheel, hand) is None:
             raise
+        belief.out_of_reach = f"{failure.what}, to hold it {hold}"
         return
     except SkillFailure as failure:
         if failure.outcome is Outcome.STALLED and where.verify is not None and where.verify() is not None:
@@ -190,6 +191,9 @@ def _given_up(belief: Belief, seen_rad: float) -> SkillFailure:
     if belief.has_slipped:
         what = f"the pads slipped at {belief.tried_nm:.1f} N m before the wheel gave way (holds: {names})"
         return SkillFailure(Outcome.SLIPPED, what)
+    if belief.out_of_reach:
+        what = f"{belief.out_of_reach}; the holds that are in reach turn it with {belief.tried_nm:.1f} N m, which is too little"
+        return SkillFailure(Outcome.UNREACHABLE, what)
     return SkillFailure(Outcome.STIFF, f"it did not give way at {belief.tried_nm:.1f} N m (holds: {names})")
 
 

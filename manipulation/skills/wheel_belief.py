@@ -45,6 +45,7 @@ class Belief:
         tried_nm: largest torque that was put on the wheel.
         has_slipped: whether the pads slipped in a hold, so that the torque at which the wheel gives way is not known.
         least_arm_m: how far from the hub the spokes must be pushed, because nearer to it did not do.
+        out_of_reach: why the arm cannot take a hold; empty where it can take each.
         lost_rad: by how much less the wheel turns in a hold than is felt, because it springs back when it is let go.
     """
 
@@ -54,6 +55,7 @@ class Belief:
     tried_nm: float = 0.0
     has_slipped: bool = False
     least_arm_m: float = 0.0
+    out_of_reach: str = ""
     lost_rad: float = 0.0
     _first_rad: float | None = None
     _last: tuple[Hold, float, float] | None = None

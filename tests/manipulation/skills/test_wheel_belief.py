@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -79,6 +80,9 @@ def test_a_wheel_that_never_moved_is_named_stiff_with_the_largest_torque_and_one
     belief.begin(1.0)
     for torque_nm in (2.1, 2.9, 1.4):
         belief.felt(torque_nm)
+    near = replace(belief, out_of_reach="no arm configuration follows the path, to hold it across")
+    beyond = _given_up(near, 1.05)
+    assert beyond.outcome is Outcome.UNREACHABLE and "the holds that are in reach turn it with 2.9 N m" in beyond.cause
     still, moved = _given_up(belief, 1.05), _given_up(belief, 1.6)
     assert (still.outcome, moved.outcome) == (Outcome.STIFF, Outcome.SLIPPED)
     assert "2.9 N m (holds: across, rim, spokes)" in still.cause

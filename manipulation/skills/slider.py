@@ -47,8 +47,6 @@ TOLERANCE_RATIO = 0.02
 LARGEST_STOP_N = 36.0
 SEEN_SIGMA_M = 0.00015  # of the best look: a third of a pixel from close up
 PUSH_SIGMA_M = 0.00025  # of the way that a cap was pushed; RMS error of 40 pushes on random panels
-# Standard deviations by which look and push may differ where both show the target; one in 370 honest pairs differs by more.
-LIKELY = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +70,7 @@ class _Push:
 
 
 @dataclass(slots=True, kw_only=True)
-class Witnesses:
+class _Witnesses:
     """The look at a slider after a push, and what was felt of the push: together they tell whether it is at its target.
 
     Attributes:
@@ -92,10 +90,7 @@ class Witnesses:
     def is_reached(self, seen: ObjectState) -> bool:
         """Return whether one of the two is surely within the tolerance, and the other one agrees."""
         is_too_unsure = SURE * seen.sigma > self._allowed  # it would contradict nothing
-        if self.felt is None or is_too_unsure or seen.value is None:
-            return False
-        both_show_it = max(abs(one - self.target) for one in (seen.value, self.felt.value)) <= self._allowed
-        if between_witnesses(self.scale, seen, self.felt, most=LIKELY if both_show_it else SURE):
+        if self.felt is None or is_too_unsure or between_witnesses(self.scale, seen, self.felt):
             return False
         return any(surely_within(one.value, self.target, self._allowed, sigma=one.sigma) for one in (seen, self.felt))
 
@@ -139,7 +134,7 @@ def slider(
         )
     _check_provable(fader)
     where = InitialState(lambda seen: seen.value, what=f"the value of {name}", current=current, verify=verify)
-    witnesses = Witnesses(scale=scale, target=target)
+    witnesses = _Witnesses(scale=scale, target=target)
 
     def stroke(attempt: Attempt) -> float:
         witnesses.felt = None
@@ -173,16 +168,12 @@ def _check_provable(fader: Slider) -> None:
         )
 
 
-def between_witnesses(scale: Scale, seen: ObjectState, felt: Felt | None, *, most: float = SURE) -> str:
-    """Return how a look at the slider and the push that was felt disagree by more than they may err; nothing if they agree.
-
-    Args:
-        most: standard deviations of their difference that are an error of both.
-    """
+def between_witnesses(scale: Scale, seen: ObjectState, felt: Felt | None) -> str:
+    """Return how a look at the slider and the push that was felt disagree by more than they may err; nothing if they agree."""
     if seen.value is None or felt is None:
         return "no look shows it" if seen.value is None else "no push was felt"
     apart = abs(seen.value - felt.value)
-    if apart <= most * float(np.hypot(seen.sigma, felt.sigma)):
+    if apart <= SURE * float(np.hypot(seen.sigma, felt.sigma)):
         return ""
     apart_mm = 1e3 * apart * _metres_per_unit(scale)
     return f"the look shows {seen.value:.4g} and the push was felt to end at {felt.value:.4g}, {apart_mm:.1f} mm apart"

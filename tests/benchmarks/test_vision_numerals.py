@@ -16,11 +16,11 @@ def test_the_gradients_are_those_of_finite_differences() -> None:
     x, wanted = random.uniform(0.0, 1.0, (7, 320)), np.eye(11)[random.integers(0, 11, 7)]
 
     def loss(**changed: np.ndarray) -> float:
-        network = Network(**{**weights, **changed})  # type: ignore[arg-type]  # in double precision here
-        found = network.probabilities(x.astype(float).reshape(7, 20, 16))  # type: ignore[arg-type]
+        network = Network(**{**weights, **changed})  # type: ignore[arg-type]  # double precision: finite differences need it
+        found = network.probabilities(x.astype(float).reshape(7, 20, 16))  # type: ignore[arg-type]  # the same
         return -float(np.log((found.astype(float) * wanted).sum(axis=1)).mean())
 
-    slopes, _ = gradients(Network(**weights), x, wanted)  # type: ignore[arg-type]
+    slopes, _ = gradients(Network(**weights), x, wanted)  # type: ignore[arg-type]  # the same
     for (name, values), slope in zip(weights.items(), slopes, strict=True):
         at = tuple(int(random.integers(0, n)) for n in values.shape)
         step = np.zeros_like(values)

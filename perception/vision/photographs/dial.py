@@ -178,7 +178,7 @@ def _told_scale(
         if ends_rad is None:
             continue
         if values[0] > values[1] and ends_rad[0] < ends_rad[1]:
-            return f"the numerals run clockwise, so {values[0]:g} to {values[1]:g} is not their scale: give the least value first"
+            return _runs_clockwise(values)
         scale = Scale(minimum=low, maximum=high, unit="", at_min=ends_rad[0], at_max=ends_rad[1])
         return _ReadScale.on(scale, SURE if printed.is_proven_if_told else BY_TICKS)
     return _scale_of(reduced, circle, values, None, circular=False)
@@ -196,9 +196,7 @@ def _scale_of(
     if circular:
         run = numerals_run(gray, *circle) if _has_ten_numerals(first, last) else 0
         if first > last and run > 0:
-            return (
-                f"the numerals run clockwise, so {first:g} to {last:g} is not their scale: give the least value first"
-            )
+            return _runs_clockwise(values)
         told = first > last or run > 0
         ends = (last, first) if run < 0 and first < last else values
         status_of = partial(_on_full_turn, minimum=ends[0], maximum=ends[1])
@@ -208,6 +206,12 @@ def _scale_of(
     scale = Scale(minimum=min(values), maximum=max(values), unit="", at_min=at_min, at_max=at_max)
     most = BY_TICKS if ends_rad is None else NARROW if abs(high - low) < NARROW_RAD else 1.0
     return _ReadScale.on(scale, most)
+
+
+def _runs_clockwise(values: tuple[float, float]) -> str:
+    """Return the reason for a refusal if a scale is told to fall clockwise and its numerals rise."""
+    first, last = values
+    return f"the numerals run clockwise, so {first:g} to {last:g} is not their scale: give the least value first"
 
 
 def _has_ten_numerals(first: float, last: float) -> bool:

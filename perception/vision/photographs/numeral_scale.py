@@ -44,7 +44,6 @@ class PrintedScale:
         off: mean distance of the numbers from the dial's middle, over the radius.
         numbers: how many fit.
         lacking: how many of its numbers were not found, or misread.
-        residual_rad: root mean square of the numbers' distance from their places.
     """
 
     minimum: float
@@ -55,7 +54,6 @@ class PrintedScale:
     off: float
     numbers: int
     lacking: int
-    residual_rad: float
 
     def is_beside(self, other: PrintedScale) -> bool:
         """Return whether another scale lies on another ring and has nearly the same sweep."""
@@ -185,8 +183,7 @@ def _fitted(values: Array, angles: Array, offs: Array, weights: Array) -> Printe
     if not SPAN_RAD[0] < abs(at_max - at_min) < SPAN_RAD[1]:
         return None
     turn = 2 * np.pi * round(0.5 * (at_min + at_max) / (2 * np.pi))
-    residual = float(np.sqrt(np.mean((angles - slope * values - start) ** 2)))
     return PrintedScale(
         minimum=low, maximum=high, at_min=at_min - turn, at_max=at_max - turn, step=step, off=float(offs.mean()),
-        numbers=len(values), lacking=round((high - low) / step) + 1 - len(values), residual_rad=residual,
+        numbers=len(values), lacking=round((high - low) / step) + 1 - len(values),
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -11,8 +11,9 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, InvalidRequest, OutOfReach, Unsupported
 from hal.frames import frame_tree
 from hal.geometry import identity
-from hal.panel import NumberGoal, PanelObject
+from hal.panel import NumberGoal, Panel, PanelObject, Shown
 from manipulation import Hand, Kinematics, out_of_reach_m, rehearse
+from perception.vision import ObjectReading
 from service.missions.check import target_of
 from service.missions.files import mission_of
 from service.missions.progress import Progress
@@ -22,7 +23,16 @@ from service.schema.mission_request import MissionRequest
 from service.schema.requests import ActionBody, ManipulateRequest
 from service.world_model import WorldModel, expected_panel
 
-__all__ = ["arm_of", "check_actions", "check_manipulate", "check_mission", "target_of", "text_of"]
+__all__ = [
+    "arm_of",
+    "check_actions",
+    "check_manipulate",
+    "check_mission",
+    "other_than_shown",
+    "target_of",
+    "text_of",
+    "usual_actions",
+]
 
 Arm = Callable[[], Kinematics | None]
 
@@ -39,6 +49,25 @@ def arm_of(connection: CellConnection, world: WorldModel) -> Kinematics | None:
 def text_of(panel_object: PanelObject, target: str | float) -> str:
     """Return a target as text for reports."""
     return str(target) if panel_object.goal is None else panel_object.goal.text(target)
+
+
+def usual_actions(panel: Panel, readings: Mapping[str, ObjectReading]) -> tuple[ActionBody, ...]:
+    """Return one action for each kind with a mission rank: change the state or value of its best-ranked object."""
+    ranked = [(one.mission_rank, one) for one in panel.objects if one.mission_rank is not None]
+    first: dict[str, PanelObject] = {}
+    ranked = [(rank, one) for rank, one in ranked if not one.forbidden and not one.confirm]
+    for _, panel_object in sorted(ranked, key=lambda pair: pair[0]):
+        first.setdefault(panel_object.kind, panel_object)
+    return tuple(other_than_shown(panel_object, readings) for panel_object in first.values())
+
+
+def other_than_shown(panel_object: PanelObject, readings: Mapping[str, ObjectReading]) -> ActionBody:
+    """Return the action that changes the present state or value of the object, or of the object that shows it."""
+    reading, goal = readings.get(panel_object.shown_by), panel_object.goal
+    if goal is None:
+        raise InvalidRequest(f"{panel_object.name} is read only", hint="leave it out of the mission")
+    shown = Shown() if reading is None else Shown(value=reading.value, state=reading.state, text=reading.text)
+    return ActionBody.model_validate({"object": panel_object.name, goal.key: goal.other_than(shown)})
 
 
 def check_manipulate(cell: Cell, request: ManipulateRequest, arm: Arm) -> None:

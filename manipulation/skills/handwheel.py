@@ -89,7 +89,7 @@ def handwheel(
         object_name=name,
         target=f"{target_rad:.3f} rad",
         is_reached=lambda seen: (
-            where.is_sure and surely_within(where.known, target_rad, TOLERANCE_RAD, sigma=seen.sigma)
+            where.is_sure and surely_within(where.nearest(seen), target_rad, TOLERANCE_RAD, sigma=seen.sigma)
         ),
         doubt=lambda seen: _doubt(where, target_rad, seen),
         verify=where.verify,
@@ -100,7 +100,7 @@ def handwheel(
 def _doubt(where: InitialState, target_rad: float, seen: ObjectState) -> str:
     if not where.is_sure:
         return "the look does not show which of its turns the wheel is in"
-    return doubt_within(where.known, target_rad, TOLERANCE_RAD, sigma=seen.sigma)
+    return doubt_within(where.nearest(seen), target_rad, TOLERANCE_RAD, sigma=seen.sigma)
 
 
 def believed_angle(wheel: Handwheel, seen: ObjectState) -> float | None:

@@ -61,6 +61,13 @@ class InitialState:
             raise InvalidRequest(f"{self._what} is not known", hint="read it first, or give `current`")
         return self._place
 
+    def nearest(self, seen: ObjectState) -> float | None:
+        """Return the place that an observation shows, with the whole periods of the known place; None if it shows none."""
+        place = self._place_of(seen)
+        if place is None or self._period is None:
+            return place
+        return place + self._period * round((self.known - place) / self._period)
+
     def moved_to(self, place: float) -> float:
         """Keep the place that the control was moved to, as measured by the tool, and return it."""
         self._place = place

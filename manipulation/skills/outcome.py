@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -38,6 +38,22 @@ class ObjectState:
     angle_rad: float | None = None
     sigma: float = 0.0
     turned_rad: float | None = None
+
+
+def mean_of(first: ObjectState, second: ObjectState) -> ObjectState:
+    """Return the mean of two looks at a control that did not move between them.
+
+    It keeps the sigma of the less sure look, because two looks share a part of their errors: the pose of the panel and the
+    light are the same. The mean of two different states is the second look as it is.
+    """
+    if first.state != second.state:
+        return second
+    value, angle_rad = second.value, second.angle_rad
+    if first.value is not None and value is not None:
+        value += 0.5 * (first.value - value)
+    if first.angle_rad is not None and angle_rad is not None:
+        angle_rad += 0.5 * wrapped(first.angle_rad - angle_rad)
+    return replace(second, value=value, angle_rad=angle_rad, sigma=max(first.sigma, second.sigma))
 
 
 SURE = 2.0  # sigmas added to the error; otherwise an object outside of the tolerance may be read as inside it

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from hal.errors import MotionRefused, Unreachable
 from manipulation.skills.attempt import ENDED, Attempt
 from manipulation.skills.context import SkillContext
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify
+from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, SkillReport, Verify, mean_of
 from manipulation.skills.retreat import retreat
 
 MAX_ATTEMPTS = 3
@@ -36,7 +36,8 @@ def perform(
     (`Attempt.felt`) needs no read-back; a look is no proof where the fingers felt the contrary, or missed in every try.
 
     Args:
-        doubt: why a look that does not show the target does not show the contrary either; nothing if it does.
+        doubt: why a look shows neither the target nor the contrary; nothing if it shows one of them. After a doubt the control
+            is looked at once more, and the mean of the two looks decides.
         repeats: whether a stroke that the look denies may be tried again, asked after each; a second press undoes a first.
 
     Raises:
@@ -56,7 +57,7 @@ def perform(
             outcome, seen = Outcome.DONE, attempt.felt
             break
         is_met, was_missed = is_met or outcome is not Outcome.MISSED, was_missed or outcome is Outcome.MISSED
-        seen = None if verify is None else verify()
+        seen = None if verify is None else _look(verify, doubt if outcome is Outcome.UNVERIFIED else None)
         if seen is not None and is_reached(seen) and is_met and not attempt.is_against:
             outcome, cause = Outcome.DONE, "the read-back confirms it"
             break
@@ -76,6 +77,15 @@ def perform(
         attempts=tries, started_s=started_s, ended_s=context.mover.state().stamp_s, motions=tuple(attempt.reports),
         peak_force_n=max((report.peak_force_n for report in attempt.reports), default=0.0), was_missed=was_missed,
     )  # fmt: skip
+
+
+def _look(verify: Verify, doubt: Callable[[ObjectState], str] | None) -> ObjectState | None:
+    """Return what a look shows, or the mean of two where the first one leaves a doubt."""
+    seen = verify()
+    if seen is None or doubt is None or not doubt(seen):
+        return seen
+    again = verify()
+    return seen if again is None else mean_of(seen, again)
 
 
 def _denied(doubt: str) -> tuple[Outcome, str]:

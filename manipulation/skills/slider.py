@@ -75,7 +75,7 @@ class _Witnesses:
 
     Attributes:
         felt: of the newest push; None before it.
-        have_disagreed: whether a look contradicted the push before it.
+        have_disagreed: whether the newest look contradicted the push before it.
     """
 
     scale: Scale
@@ -95,12 +95,15 @@ class _Witnesses:
         return any(surely_within(one.value, self.target, self._allowed, sigma=one.sigma) for one in (seen, self.felt))
 
     def doubt(self, seen: ObjectState) -> str:
-        """Return why the slider may or may not be at its target; nothing if the look surely shows it elsewhere."""
+        """Return why the slider may or may not be at its target; nothing if the look surely shows it there or elsewhere."""
+        self.have_disagreed = False
+        if self.is_reached(seen):
+            return ""
         doubtful = doubt_within(seen.value, self.target, self._allowed, sigma=seen.sigma)
         if not doubtful and not surely_within(seen.value, self.target, self._allowed, sigma=seen.sigma):
             return ""
         between = between_witnesses(self.scale, seen, self.felt)
-        self.have_disagreed = self.have_disagreed or bool(between)
+        self.have_disagreed = bool(between)
         return between or doubtful
 
 

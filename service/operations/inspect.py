@@ -143,7 +143,7 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     objects = [session.panel.object(name) for name in names]
     distance_m = viewpoints.reading_distance_m(session.lens())
     groups = viewpoints.close_up_groups(objects, session.lens(), distance_m)
-    groups = [groups[k] for k in visiting_order(_camera_over_panel(session), [centre_m for centre_m, _ in groups])]
+    groups = [groups[k] for k in visiting_order(camera_over_panel(session), [centre_m for centre_m, _ in groups])]
     readings: dict[str, ObjectReading] = {}
     pictures: list[AnnotatedView] = []
     scans: list[Scan] = []
@@ -156,7 +156,7 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     return Inspection(readings=readings, pictures=tuple(pictures), scans=tuple(scans))
 
 
-def _camera_over_panel(session: Session) -> Array:
+def camera_over_panel(session: Session) -> Array:
     """Return the panel point (3,) in front of which the camera is."""
     camera = base_from(session, session.first(DeviceKind.CAMERA)).parent_from_child
     x, y, _ = session.known_panel().parent_from_child.inv().apply(camera.translation)

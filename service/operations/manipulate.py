@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import (
     CellError,
     DeviceError,
-    InvalidRequest,
     MotionError,
     NotFound,
     PerceptionError,
@@ -20,7 +21,7 @@ from hal.panel import PanelObject, Shown
 from manipulation import ObjectState, Outcome, SkillReport, Verify, free_hand, operate
 from perception.vision import ObjectReading, said
 from service.feasibility import target_of, text_of
-from service.operations.inspect import ensure_located, look_close, look_past, tell
+from service.operations.inspect import camera_over_panel, ensure_located, look_close, look_past, tell
 from service.operations.locate import OFF_PLACE_M, ensure_space_is_known, look_again
 from service.operations.session import Session
 from service.operations.travel import park, skill_context
@@ -28,6 +29,9 @@ from service.report.plots import png_of
 from service.report.record import Picture
 from service.schema.mission_results import ActionResult, ManipulateResult
 from service.schema.requests import ActionBody, ManipulateRequest
+
+SAME_PLACE_M = 0.002  # a camera that is nearer to the axis of a control looks at it
+BESIDE_M = 0.05  # from the place of a first look to that of a second one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -178,26 +182,6 @@ def _after_doubt(
     return both, [shift.finding]
 
 
-def usual_actions(session: Session) -> tuple[ActionBody, ...]:
-    """Return one action for each kind with a mission rank: change the state or value of its best-ranked object."""
-    readings = session.world.readings
-    ranked = [(one.mission_rank, one) for one in session.panel.objects if one.mission_rank is not None]
-    first: dict[str, PanelObject] = {}
-    ranked = [(rank, one) for rank, one in ranked if not one.forbidden and not one.confirm]
-    for _, panel_object in sorted(ranked, key=lambda pair: pair[0]):
-        first.setdefault(panel_object.kind, panel_object)
-    return tuple(other_than_shown(panel_object, readings) for panel_object in first.values())
-
-
-def other_than_shown(panel_object: PanelObject, readings: Mapping[str, ObjectReading]) -> ActionBody:
-    """Return the action that changes the present state or value of the object, or of the object that shows it."""
-    reading, goal = readings.get(panel_object.shown_by), panel_object.goal
-    if goal is None:
-        raise InvalidRequest(f"{panel_object.name} is read only", hint="leave it out of the mission")
-    shown = Shown() if reading is None else Shown(value=reading.value, state=reading.state, text=reading.text)
-    return ActionBody.model_validate({"object": panel_object.name, goal.key: goal.other_than(shown)})
-
-
 def _shows(witness: PanelObject, reading: ObjectReading, target: str | float) -> bool:
     goal = Shown(state=target) if isinstance(target, str) else Shown(value=target)
     return witness.is_right(Shown(value=reading.value, state=reading.state), goal)
@@ -267,10 +251,22 @@ class _Eye:
         self.last = self._look()
         return None if self.last is None else object_state(self.last, self.witness)
 
+    def _station_m(self) -> Array:
+        """Return the panel point to look at: the witness, or a point beside it where the camera looks at the witness already.
+
+        A second look has errors of its own only from another place. That place is nearer to the middle of the panel, where
+        the arm reaches it.
+        """
+        at_m = np.array(self.witness.point_m)
+        if np.linalg.norm((camera_over_panel(self._session) - at_m)[:2]) > SAME_PLACE_M:
+            return at_m
+        angle_rad = np.arctan2(-at_m[1], -at_m[0])
+        return at_m + BESIDE_M * np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
+
     def _look(self) -> ObjectReading | None:
         self.is_off_its_place = self.is_missing = False
         try:
-            straight = look_close(self._session, self.witness.point_m, (self.witness.name,))
+            straight = look_close(self._session, self._station_m(), (self.witness.name,))
             self.is_missing = not straight.readings[self.witness.name].present
             self.is_off_its_place = self.is_missing or straight.offset_m > OFF_PLACE_M
             found = look_past(self._session, straight)

@@ -18,6 +18,7 @@ from hal.geometry import compose
 from perception.vision import PanelWay
 from service.errors import Defect
 from service.evaluate import AFTER
+from service.feasibility import other_than_shown, usual_actions
 from service.missions.conditions import Seen
 from service.missions.files import mission_of
 from service.missions.interpreter import Interpreter, leaves_of
@@ -43,13 +44,8 @@ from service.operations.locate import (
     rims_in,
     scan_plate,
 )
-from service.operations.manipulate import other_than_shown, refused_action, usual_actions, work
-from service.operations.range_detection import (
-    SurfaceView,
-    check_surfaces,
-    need_its_place,
-    surfaces_of_mission,
-)
+from service.operations.manipulate import refused_action, work
+from service.operations.range_detection import SurfaceView, check_surfaces, need_its_place, surfaces_of_mission
 from service.operations.sense import feel, fuse_and_remember, fused_result, pose_error
 from service.operations.session import OperationContext, Session, panel_object_or_all
 from service.operations.travel import leave_the_panel, park, plan_mission
@@ -246,7 +242,8 @@ class _Worker:
 
     def set(self, step: SetStep) -> str:
         self._check_surfaces(*self._span(0.0, 0.0))
-        bodies = usual_actions(self.session) if step.each_kind else (self._action(step),)
+        panel, readings = self.session.panel, self.session.world.readings
+        bodies = usual_actions(panel, readings) if step.each_kind else (self._action(step),)
         told = []
         for k, body in enumerate(bodies):
             with _step(

@@ -19,7 +19,15 @@ from manipulation.skills.attempt import Attempt
 from manipulation.skills.contact import onset, step
 from manipulation.skills.context import SkillContext
 from manipulation.skills.operate import operate
-from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure, doubt_within, surely_within, wrapped
+from manipulation.skills.outcome import (
+    ObjectState,
+    Outcome,
+    SkillFailure,
+    doubt_within,
+    mean_of,
+    surely_within,
+    wrapped,
+)
 from manipulation.skills.probe import contact_of
 from manipulation.skills.repeat import perform
 from manipulation.skills.retreat import retreat
@@ -157,6 +165,35 @@ def test_a_look_that_is_merely_unsure_is_not_said_to_deny_the_target(
         verify=lambda: ObjectState(name="o", value=value, sigma=sigma),
     )  # fmt: skip
     assert result.outcome is outcome and said in result.cause
+
+
+@pytest.mark.parametrize(
+    ("second", "outcome", "said"),
+    [
+        (70.3, Outcome.DONE, "confirms"),  # the mean is 70.7
+        (71.3, Outcome.UNVERIFIED, "a look that shows 71.2 and is sure to 1.2 does not tell"),
+        (None, Outcome.UNVERIFIED, "a look that shows 71.1 and is sure to 1.2 does not tell"),
+    ],
+)
+def test_the_mean_of_two_looks_decides_where_the_first_one_leaves_a_doubt(
+    second: float | None, outcome: Outcome, said: str
+) -> None:
+    looks = iter(None if value is None else ObjectState(name="o", value=value, sigma=0.6) for value in (71.1, second))
+    result = perform(
+        context(COMPLETED), lambda attempt: 1.0, skill="s", object_name="o", target="70",
+        is_reached=lambda seen: surely_within(seen.value, 70.0, 2.0, sigma=seen.sigma),
+        doubt=lambda seen: doubt_within(seen.value, 70.0, 2.0, sigma=seen.sigma),
+        verify=lambda: next(looks), repeats=lambda: False,
+    )  # fmt: skip
+    assert result.outcome is outcome and said in result.cause
+
+
+def test_the_mean_of_two_looks_goes_the_short_way_round_and_is_no_surer_than_either() -> None:
+    first = ObjectState(name="o", angle_rad=np.pi - 0.1, sigma=0.02)
+    second = ObjectState(name="o", angle_rad=-np.pi + 0.3, sigma=0.01)
+    both = mean_of(first, second)
+    assert wrapped(both.angle_rad - (-np.pi + 0.1)) == pytest.approx(0.0) and both.sigma == 0.02
+    assert mean_of(ON, OFF) == OFF
 
 
 @given(truth=st.floats(60.0, 80.0), error=st.floats(-2.0, 2.0), sigma=st.floats(0.0, 0.9))

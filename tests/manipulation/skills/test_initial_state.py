@@ -88,3 +88,10 @@ def test_turns_that_no_look_has_told_apart_are_not_sure() -> None:
     assert not where.is_sure
     where.verify()
     assert not where.is_sure
+
+
+def test_an_observation_is_taken_with_the_whole_periods_that_are_known() -> None:
+    where = InitialState(value_of, what="it", current=at(13.0), verify=None, period=6.0)
+    assert where.nearest(at(1.4)) == pytest.approx(13.4)
+    assert where.nearest(at(None)) is None
+    assert InitialState(value_of, what="it", current=at(13.0), verify=None).nearest(at(1.4)) == 1.4

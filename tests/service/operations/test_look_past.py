@@ -18,7 +18,7 @@ from hal.simulated import Fault
 from manipulation.skills.context import panel_from_grip
 from perception.vision import viewpoints
 from perception.vision.reading import ANSWER_AT, ObjectReading, answer_at
-from service.operations import inspect, locate, range_detection
+from service.operations import inspect, locate, manipulate, range_detection
 from service.operations.inspect import Inspection, close_ups, inspect_close
 from service.operations.session import Session
 from service.operations.travel import skill_context
@@ -188,3 +188,18 @@ def test_a_plate_that_is_not_where_it_was_located_is_no_obstacle(session: Sessio
     finally:
         session.world.believe_panel(pose)
     assert session.world.obstacles == ()
+
+
+def test_a_second_look_without_a_stroke_between_is_taken_from_beside(session: Session) -> None:
+    eye = manipulate._Eye(session, session.panel.object("setpoint"), True)
+    verify = eye.verify()
+    assert verify is not None
+    truth, places = truth_of(session, "setpoint").value, []
+    for _ in range(2):
+        seen = verify()
+        assert seen is not None and seen.value == pytest.approx(truth, abs=2.0)
+        places.append(inspect.camera_over_panel(session))
+    assert np.linalg.norm(places[1] - places[0]) == pytest.approx(manipulate.BESIDE_M, abs=0.002)
+    straight_look(session)  # of another object: the arm has moved, as it does in a stroke
+    assert verify() is not None
+    np.testing.assert_allclose(inspect.camera_over_panel(session), places[0], atol=0.002)

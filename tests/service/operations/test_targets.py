@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,12 +10,10 @@ import pytest
 from hal.config import Cell, load_cell
 from hal.errors import InvalidRequest, NoRoom, OutOfReach
 from manipulation import Kinematics
-from service.feasibility import target_of
+from service.feasibility import target_of, usual_actions
 from service.operations import OPERATIONS
-from service.operations.manipulate import usual_actions
 from service.problem import status_of
 from service.schema.requests import ActionBody
-from service.world_model import WorldModel
 from tests.manipulation.arms import T3
 
 CELL = load_cell(Path(__file__).parents[3] / "cells/bench.toml")
@@ -119,8 +116,8 @@ def test_a_mission_presses_by_itself_only_what_shows_that_it_was_pressed() -> No
         ((bell, latching), [("hold", "pressed")]),
         ((bell,), []),
     ):
-        session: Any = SimpleNamespace(panel=CELL.panel.model_copy(update={"objects": things}), world=WorldModel())
-        assert [(body.object, body.state) for body in usual_actions(session)] == wanted
+        bodies = usual_actions(CELL.panel.model_copy(update={"objects": things}), {})
+        assert [(body.object, body.state) for body in bodies] == wanted
 
 
 @pytest.mark.parametrize("verb", ["inspect", "recognise"])

@@ -22,8 +22,8 @@ import numpy as np
 from playwright.sync_api import Browser, sync_playwright
 
 from benchmarks.console_jobs import JOBS
-from benchmarks.console_served import FINAL, Served, new_page, served, until
-from tests.service.browser import CHROMIUM, CONSOLE_PAGES, FLAGS
+from benchmarks.console_served import CHROMIUM_OF_OTHERS, FINAL, Served, new_page, served, until
+from tests.service.browser import CONSOLE_PAGES, FLAGS
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES, SCHEMES = ((1440, 900), (390, 844)), ("light", "dark")
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lines: list[Line] = []
     print(f"load {os.getloadavg()[0]:.1f} at the start")
     with served(given.cell) as service, sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        browser = play.chromium.launch(executable_path=str(CHROMIUM_OF_OTHERS), args=FLAGS)
         service.end("/v1/missions", {"file": "inspect"})
         for part in given.only.split(","):
             print(f"{part} ...", flush=True)

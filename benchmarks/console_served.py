@@ -22,6 +22,7 @@ from service.client import Client
 from service.processes.latch import LATCH, Latch
 
 ROOT = Path(__file__).resolve().parents[1]
+CHROMIUM_OF_OTHERS = ROOT / "benchmarks/chromium_of_others.sh"
 PATIENCE_MS = 150_000
 FINAL = ("succeeded", "failed", "cancelled")
 

@@ -29,6 +29,7 @@ import numpy as np
 import psutil
 from websockets.sync.client import connect
 
+from benchmarks.console_served import CHROMIUM_OF_OTHERS
 from benchmarks.control_probe import REALTIME, ControlProbe, control_probe
 from hal.outlets import MqttSection, OpcuaSection, OutletsSection, PrometheusSection, SparkplugSection, WebhookSection
 from service.processes.client_host import GATEWAY
@@ -60,7 +61,7 @@ BROWSERS = """
 import select, sys
 from playwright.sync_api import sync_playwright
 with sync_playwright() as play:
-    browser = play.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox", "--disable-gpu"])
+    browser = play.chromium.launch(executable_path=sys.argv[2], args=["--no-sandbox", "--disable-gpu"])
     pages = [browser.new_context().new_page() for _ in range(10)]
     for page in pages:
         page.goto(sys.argv[1], timeout=120000, wait_until="domcontentloaded")
@@ -203,8 +204,7 @@ def _silent(served: Served) -> Iterator[None]:
 def _browsers(served: Served) -> Iterator[None]:
     """Show the console on ten pages, and let each ask for another page of it now and then."""
     with tempfile.TemporaryFile("w+") as log:
-        # They stand for other machines, so that they get what this one has left.
-        command = ["nice", "-n", "19", sys.executable, "-c", BROWSERS, served.console_url]
+        command = [sys.executable, "-c", BROWSERS, served.console_url, str(CHROMIUM_OF_OTHERS)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True) as process:
             assert process.stdin is not None and process.stdout is not None
             if process.stdout.readline().strip() != "shown":

@@ -175,6 +175,7 @@ class ObjectDialog:
         one = self._object
         if one is None:
             return
+        await self._mirror.ask_now("tasks")  # a task that ended a moment ago must refuse nothing
         active = self._mirror.active
         if active is not None:
             self._told.set_content(attribute(say("object.busy", verb=word("verb", active["verb"]))))

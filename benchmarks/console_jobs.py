@@ -35,7 +35,7 @@ def review_a_reading(page: Page, client: Client, until: Until) -> None:
         raise RuntimeError("no reading waits: this run cannot count the clicks of a review")
     page.click("nav a:text-is('Review')")
     page.fill("input[aria-label='Your name, for the record']", "benchmark")
-    until(page, "document.querySelector('.answers button') !== null")
+    until(page, "document.querySelector('.answers button') !== null && window.did_handshake")
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("1")
     until(page, "document.querySelector('.main').textContent.includes('you have answered 1')")

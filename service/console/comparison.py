@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 
 from nicegui import ui
@@ -51,7 +50,7 @@ class Comparison:
     async def _load(self) -> None:
         panel, newest, against = self._mirror.panel, self._mirror.readings(), self._against
         objects = [one for one in panel.objects if one.name in newest] if panel is not None else []
-        before = await asyncio.gather(*(self._before(newest[one.name], against) for one in objects))
+        before = [await self._before(newest[one.name], against) for one in objects]
         if against == self._against:
             rows = [row_of(one, newest[one.name], old) for one, old in zip(objects, before, strict=True)]
             self._html = table(COLUMNS, rows, name=say("compare.heading"), empty=say("compare.none"))

@@ -18,6 +18,7 @@ TICK_S = 0.25
 IDLE_S = 15.0  # nobody has looked for so long: do not ask
 LEFT_S = 600.0  # nobody has looked for so long: whoever looked has left
 ROBOT_S = 2.0  # nobody has looked at the robot for so long: its stream is closed
+MOST_ASKED = 3  # at once: more answers in one turn of the service's event loop would keep others waiting
 FEED_S = 10.0  # so long does the service keep a question for new readings and alarms
 PERIODS_S = {
     "ready": 1.0, "tasks": 0.5, "history": 5.0, "alarms": 5.0, "devices": 2.0, "frames": 1.0, "lease": 2.0,
@@ -74,6 +75,7 @@ class Mirror:
         self._robot_wanted_s = -IDLE_S
         self._loops: list[asyncio.Task[None]] = []
         self._asking: set[asyncio.Task[None]] = set()
+        self._slots = asyncio.Semaphore(MOST_ASKED)
 
     def start(self) -> None:
         """Begin to ask, in the running event loop."""
@@ -236,7 +238,9 @@ class Mirror:
 
     async def _ask(self, topic: str) -> None:
         try:
-            self._keep(topic, await self.client.get(self._path(topic), timeout_s=QUICK_S))
+            async with self._slots:
+                answer = await self.client.get(self._path(topic), timeout_s=QUICK_S)
+            self._keep(topic, answer)
             self.version += self.problem is not None
             self.problem = None
         except CellError as error:

@@ -113,6 +113,8 @@ class _Desk:
                 self._answered += 1
                 self._over.add(number)
                 self._other.set_value("")
+            else:
+                await self._mirror.ask_now("review")  # somebody else may have answered it
         finally:
             self._is_sending = False
         if is_stored and self._teaches.value and body["verdict"] != "unreadable":

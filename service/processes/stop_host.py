@@ -16,7 +16,7 @@ from hal.config import LossAction
 from hal.errors import ConfigError, MotionRefused
 from service.processes.beat import SILENCE_S, Beat
 from service.processes.child import Child
-from service.processes.latch import Latch, LatchState, StopLevel
+from service.processes.latch import UNREADABLE, Latch, LatchState, StopLevel
 from service.processes.stop import StopServer
 
 STOP_ANSWER_S = 0.5  # after this, the latch is set from this process
@@ -143,7 +143,7 @@ class ProcessStop:
 
     def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the stop through the stop process, or directly when that does not answer."""
-        count = self._latch.state().count
+        count = self._readable(STOP_ANSWER_S).count
         command = "hold" if level is StopLevel.HOLD else "stop"
         is_told = self._child.is_alive() and self._child.write_line(f"{command} {_line(source)}")
         if not (is_told and self._has_changed(count, STOP_ANSWER_S)):
@@ -156,7 +156,7 @@ class ProcessStop:
         Raises:
             MotionRefused: it did not answer in time; a late answer clears nothing.
         """
-        if self._latch.state().count != seen_count:
+        if self._readable(STOP_ANSWER_S).count != seen_count:
             return False
         self._is_ready.wait(RESET_ANSWER_S)
         is_told = self._child.write_line(f"reset {seen_count} {_line(source)}")
@@ -166,7 +166,7 @@ class ProcessStop:
                 "the stop process did not answer, so the stop stays latched",
                 hint="look at the cell, then reset again; is the machine overloaded?",
             )
-        now = self._latch.state()
+        now = self._readable(STOP_ANSWER_S)
         return not now.is_latched and now.count == seen_count + 1
 
     def is_alive(self) -> bool:
@@ -222,12 +222,21 @@ class ProcessStop:
         end_s = time.monotonic() + within_s
         pause = threading.Event()
         while time.monotonic() < end_s:
-            if self._latch.state().count != count:
+            now = self._latch.state()
+            if now != UNREADABLE and now.count != count:
                 return True
             if self.lost() is not None:
                 return False
             pause.wait(0.0005)
         return False
+
+    def _readable(self, within_s: float) -> LatchState:
+        """Return the latch's record when no write is under way; the writer may have lost its processor for some ms."""
+        end_s = time.monotonic() + within_s
+        pause = threading.Event()
+        while (now := self._latch.state()) == UNREADABLE and time.monotonic() < end_s and self.lost() is None:
+            pause.wait(0.0005)
+        return now
 
 
 def _line(text: str) -> str:

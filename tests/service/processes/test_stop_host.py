@@ -18,7 +18,7 @@ from hal.errors import MotionRefused
 from manipulation.control.way_back import LONGEST_S
 from service.processes import cell, stop
 from service.processes.beat import Beat, every_beat
-from service.processes.latch import Latch, StopLevel
+from service.processes.latch import UNREADABLE, Latch, StopLevel
 from service.processes.stop_host import ProcessStop, bound_socket
 from tests.service.waiting import eventually
 
@@ -149,3 +149,17 @@ def test_answers_do_not_wait_for_the_acknowledgement_of_their_first_packet() -> 
 def _pid(host: ProcessStop) -> int:
     assert host.pid is not None
     return host.pid
+
+
+@pytest.mark.parametrize("unreadable", [1, 2, 3])
+def test_a_writer_that_loses_its_processor_in_mid_write_refuses_no_reset_and_acknowledges_no_stop_early(
+    unreadable: int, latch: Latch, host: ProcessStop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A record that could not be read counted as a change: resets that were done were said to be refused."""
+    read, mid_write = latch.state, iter([True] * unreadable)
+    count = host.stop("a person").count
+    assert latch.is_set()
+    monkeypatch.setattr(latch, "state", lambda: UNREADABLE if next(mid_write, False) else read())
+    assert host.reset("test", seen_count=count)
+    mid_write = iter([True] * unreadable)
+    assert host.stop("another person").source == "another person"

@@ -1,25 +1,31 @@
 """The console in a real browser beside the real service: `python -m benchmarks.console [--readings 20] [--kills 50] [--cell FILE]`.
 
 Starts `panelwright serve` and headless Chromium, and measures: from a click to the value on the page without the time of the
-reading; the event loop of the service and its stops beside a mission with ten browsers; how soon a page is painted and of use; axe
-violations over all pages; clicks for four jobs; and missions that a killed console harms. Prints a table with the pass lines, and
-returns 1 if one is missed. `--only latency,crowd,paint,axe,clicks,kills` chooses.
+reading; the event loop of the service and its stops beside a mission with ten browsers; how many places of a moving arm reach ten
+browsers that show the cell in 3-D; how soon a page is painted and of use; axe violations over all pages; clicks for four jobs; and
+missions that a killed console harms (half an hour, because its pauses grow). Prints a table with the pass lines, and returns 1 if
+one is missed. `--only latency,crowd,scene,paint,axe,clicks,kills` chooses.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from playwright.sync_api import Browser, sync_playwright
+from websockets.sync.client import connect
 
 from benchmarks.console_jobs import JOBS
 from benchmarks.console_served import CHROMIUM_OF_OTHERS, FINAL, Served, new_page, served, until
@@ -40,6 +46,9 @@ SEEN_IN_DIALOG = f"""() => {{ window.seenMs = window.clickMs = null; const befor
   const look = () => {{ if ({FACTS} !== before) window.seenMs = Date.now(); else requestAnimationFrame(look); }};
   look(); }}"""
 PAINT = """() => ({ first: performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? null })"""
+COUNT_MOVES = """() => { window.moves = 0;
+  window.socket.onAny((event, ...said) => { window.moves += JSON.stringify(said).includes('"move'); }); }"""
+TURNED_RAD, LEAST_SAMPLES = 0.003, 10  # less than this moves no part of the drawing by its resolution
 USABLE = (
     "document.querySelector('#stop-box')?.dataset.latched === 'no' && document.querySelector('g[data-object]') !== null"
 )
@@ -135,6 +144,47 @@ def crowd(service: Served, browser: Browser, given: argparse.Namespace) -> Itera
     )
 
 
+def scene(service: Served, browser: Browser, _given: argparse.Namespace) -> Iterator[Line]:
+    """Count how many of the places of a moving arm reach ten browsers that show the cell in 3-D."""
+    pages = [new_page(browser) for _ in range(BROWSERS)]
+    for page in pages:
+        page.goto(service.console_url + "/cell")
+        until(page, "window.did_handshake && document.body.textContent.includes('Contact force')")
+    pages[0].wait_for_timeout(5000)  # all of them have drawn the cell
+    for page in pages:
+        page.evaluate(COUNT_MOVES)
+    with _samples(service) as samples:
+        task = service.end("/v1/missions", {"file": "inspect"})
+    pages[0].wait_for_timeout(1000)
+    turned_rad = np.abs(np.diff([sample["position_rad"] for sample in samples], axis=0)).max(axis=1)
+    moved = int(np.count_nonzero(turned_rad > TURNED_RAD))
+    received = [int(page.evaluate("window.moves")) for page in pages]
+    for page in pages:
+        page.context.close()
+    if task["state"] != "succeeded" or moved < LEAST_SAMPLES:
+        raise RuntimeError(f"the arm moved in {moved} samples only: {task['problem']}")
+    share = min(received) / moved
+    yield Line(
+        what=f"cell in 3-D: share of {moved} places of the arm that reach each of {BROWSERS} browsers, least",
+        measured=f"{share:.2f}",
+        wanted="0.97",
+        is_met=share >= 0.97,
+    )
+
+
+@contextmanager
+def _samples(service: Served) -> Iterator[list[dict[str, Any]]]:
+    """Yield the list to which the states of the robot are added as the service streams them."""
+    samples: list[dict[str, Any]] = []
+    with connect(f"{service.url.replace('http', 'ws', 1)}/v1/stream", proxy=None) as stream:
+        reader = threading.Thread(
+            target=lambda: samples.extend(one for text in stream if "position_rad" in (one := json.loads(text)))
+        )
+        reader.start()
+        yield samples
+    reader.join()
+
+
 def paint(service: Served, browser: Browser, given: argparse.Namespace) -> Iterator[Line]:
     """Measure the first paint, and when drawing and stop of the panel's page are there, in fresh browser profiles."""
     first_s, usable_s = [], []
@@ -227,6 +277,7 @@ def _stop(service: Served) -> float:
 PARTS: dict[str, Callable[[Served, Browser, argparse.Namespace], Iterator[Line]]] = {
     "latency": latency,
     "crowd": crowd,
+    "scene": scene,
     "paint": paint,
     "axe": axe,
     "clicks": clicks,

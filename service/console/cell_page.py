@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 
 from service.access.keys import Role
-from service.console.cell_scene import CellScene
+from service.console.cell_scene import BatchedScene, CellScene
 from service.console.mirror import Mirror
 from service.console.page_frame import Place, attempt, button, live, page_frame
 from service.console.poses import base_from, frames_of, has_moved
@@ -34,7 +34,9 @@ def install(place: Place) -> None:
             ui.html(say("cell.heading"), sanitize=False, tag="h2")
             with ui.element("div").props(f'role="img" aria-label="{attribute(say("cell.scene"))}"'):
                 lens = ui.scene.perspective_camera(fov=FIELD_DEG)
-                scene = ui.scene(width=1000, height=512, grid=GRID, camera=lens, background_color=SKY).classes("scene")
+                scene = BatchedScene(width=1000, height=512, grid=GRID, camera=lens, background_color=SKY).classes(
+                    "scene"
+                )
             scene.move_camera(x=-0.75, y=-1.35, z=1.35, look_at_x=0.5, look_at_y=0.0, look_at_z=0.5, duration=0)
             drawn = CellScene(scene, mirror)
             ui.timer(DRAWN_S, drawn.renew)

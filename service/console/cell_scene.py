@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from nicegui import json, ui
+from nicegui.awaitable_response import AwaitableResponse, NullResponse
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
@@ -14,6 +19,7 @@ from service.console.mirror import Mirror
 from service.console.poses import base_from, frames_of, lens_of
 
 FRUSTUM_M = 0.35
+LEAST_ROD_M = 1e-3
 JOINT_M, LINK_M = 0.05, 0.04  # for the eye; the planner has its own radii
 SIGMAS_SHOWN = 3.0 * 10.0  # three standard deviations, ten times enlarged
 ARM, PLATE, VIEW, HAZE = "#2f6fd0", "#8894a0", "#e08600", "#c03a78"
@@ -38,26 +44,86 @@ def joint_frames(links: list[dict[str, float]], position_rad: list[float]) -> li
     return frames
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnLink:
+    """Where a link of the arm is drawn: the joint at its end and the middle of the rod, m; `turn` (3, 3) of the rod's y axis.
+
+    A link without length has no rod: its `turn` is None.
+    """
+
+    joint_m: list[float]
+    middle_m: list[float]
+    length_m: float
+    turn: list[list[float]] | None
+
+
+def drawn_links(links: list[dict[str, float]], position_rad: list[float]) -> list[DrawnLink]:
+    """Return where the links of an arm are drawn, rounded to a millimetre; arguments as for `joint_frames`."""
+    points = np.round([frame.translation for frame in joint_frames(links, position_rad)], 3)
+    return [_link(a, b) for a, b in itertools.pairwise(points)]
+
+
+def _link(a: Array, b: Array) -> DrawnLink:
+    length_m = float(np.linalg.norm(b - a))
+    turn = along_y(b - a) if length_m > LEAST_ROD_M else None
+    return DrawnLink(joint_m=b.tolist(), middle_m=((a + b) / 2).tolist(), length_m=length_m, turn=turn)
+
+
+def along_y(direction: Array) -> list[list[float]]:
+    """Return the rotation (3, 3) that brings a cylinder, which lies along y, into a direction."""
+    turn: list[list[float]] = Rotation.align_vectors([direction], [[0.0, 1.0, 0.0]])[0].as_matrix().tolist()
+    return turn
+
+
+class BatchedScene(ui.scene):
+    """A drawing in 3-D whose changes within `together` reach the browser in one message instead of one each."""
+
+    _calls: list[tuple[str, tuple[Any, ...]]] | None = None
+
+    def run_method(self, name: str, *args: Any, timeout: float = 1.0) -> AwaitableResponse:
+        """Call a method of the drawing in the browser."""
+        if self._calls is None:
+            return super().run_method(name, *args, timeout=timeout)
+        self._calls.append((name, args))
+        return NullResponse()
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Collect the calls of this block, and send them at its end."""
+        calls: list[tuple[str, tuple[Any, ...]]] = []
+        self._calls = calls
+        try:
+            yield
+        finally:
+            self._calls = None
+        if calls:
+            each = f"for (const [name, args] of {json.dumps(calls)}) runMethod({self.id}, name, args)"
+            self.client.run_javascript(each)
+
+
 class CellScene:
     """What the scene shows, renewed only where the service said something new."""
 
-    def __init__(self, scene: Any, mirror: Mirror) -> None:
+    def __init__(self, scene: BatchedScene, mirror: Mirror) -> None:
         self._scene = scene
         self._mirror = mirror
         self._parts: dict[str, tuple[Any, list[Any]]] = {}
-        self._points: list[list[float]] | None = None
+        self._links: list[DrawnLink] | None = None
         self._force: list[float] | None = None
         self._arrow: tuple[Any, Any] | None = None
         self._arm_parts: list[tuple[Any, Any]] = []
 
     def renew(self) -> None:
         """Draw again what has changed."""
+        with self._scene.together():
+            self._renew()
+
+    def _renew(self) -> None:
         frames = frames_of(self._mirror)
-        points = self._arm_points()
-        if points is not None and points != self._points:
-            self._points = points
-            with self._scene:
-                self._arm(points)
+        links = self._arm_links()
+        if links is not None and links != self._links:
+            self._links = links
+            self._arm(links)
         self._draw_force()
         planned = self._mirror.planned
         self._part("way", [] if planned is None else planned["result"]["plan"]["stations"], self._way)
@@ -78,13 +144,16 @@ class CellScene:
         found: list[dict[str, Any]] = self._mirror.said("devices", {"devices": []})["devices"]
         return found
 
-    def _arm_points(self) -> list[list[float]] | None:
+    def _arm_links(self) -> list[DrawnLink] | None:
         model, robot = self._mirror.said("arm_model"), self._mirror.robot
         if model is None or robot is None or not model["capabilities"]:
             return None
-        frames = joint_frames(model["capabilities"]["links"], robot["position_rad"])
-        points: list[list[float]] = np.round([frame.translation for frame in frames], 3).tolist()
-        return points
+        rows = model["capabilities"]["links"]
+
+        def drawn(said: dict[str, Any]) -> list[DrawnLink]:
+            return drawn_links(rows, said["position_rad"])
+
+        return self._mirror.computed("arm", robot, drawn)
 
     def _part(self, name: str, said: Any, draw: Any) -> None:
         before = self._parts.get(name)
@@ -95,21 +164,22 @@ class CellScene:
         with self._scene:
             self._parts[name] = (said, draw(said))
 
-    def _arm(self, points: list[list[float]]) -> None:
-        """Draw joints and links once and move them afterwards, which costs a browser little."""
-        links = list(itertools.pairwise(np.array(points)))
+    def _arm(self, links: list[DrawnLink]) -> None:
+        """Draw joints and rods once and move them afterwards, which costs a browser little."""
         if not self._arm_parts:
-            lengths = [float(np.linalg.norm(b - a)) for a, b in links]
-            self._arm_parts = [
-                (self._scene.sphere(JOINT_M).material(ARM), self._scene.cylinder(LINK_M, LINK_M, length).material(ARM))
-                for length in (max(length, 1e-3) for length in lengths)
-            ]
-        for (a, b), (joint, rod) in zip(links, self._arm_parts, strict=True):
-            joint.move(*b)
-            rod.move(*((a + b) / 2))
-            if np.linalg.norm(b - a) > 1e-3:
-                turn, _ = Rotation.align_vectors([b - a], [[0.0, 1.0, 0.0]])  # a cylinder lies along y
-                rod.rotate_R(turn.as_matrix().tolist())
+            with self._scene:
+                self._arm_parts = [
+                    (
+                        self._scene.sphere(JOINT_M).material(ARM),
+                        self._scene.cylinder(LINK_M, LINK_M, max(link.length_m, LEAST_ROD_M)).material(ARM),
+                    )
+                    for link in links
+                ]
+        for link, (joint, rod) in zip(links, self._arm_parts, strict=True):
+            joint.move(*link.joint_m)
+            rod.move(*link.middle_m)
+            if link.turn is not None:
+                rod.rotate_R(link.turn)
 
     def _draw_force(self) -> None:
         """Draw the contact force at the flange as an arrow; it is made once and moved afterwards."""
@@ -132,13 +202,13 @@ class CellScene:
             part.visible(size_n >= LEAST_N)
         if size_n >= LEAST_N:
             length_m, along = FORCE_M_PER_N * size_n, force_n / size_n
-            turn = Rotation.align_vectors([along], [[0.0, 1.0, 0.0]])[0].as_matrix().tolist()  # a cylinder lies along y
+            turn = along_y(along)
             shaft.scale(1.0, length_m, 1.0).move(*(flange.translation + along * length_m / 2)).rotate_R(turn)
             head.move(*(flange.translation + along * (length_m + HEAD_LONG_M / 2))).rotate_R(turn)
 
     def _way(self, stations: list[dict[str, Any]]) -> list[Any]:
         """Draw the way of the flange through the stations of a plan, with a ball at each."""
-        drawn = []
+        drawn: list[Any] = []
         for one in stations:
             drawn += [
                 self._scene.line(start, end).material(WAY) for start, end in itertools.pairwise(one.get("flange_m", []))
@@ -162,7 +232,7 @@ class CellScene:
             .rotate_R(turn)
             .material(PLATE)
         )
-        drawn = [plate]
+        drawn: list[Any] = [plate]
         for one in panel.objects:
             height = one.envelope().height_m
             half_w, half_h = one.half_footprint_m

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from hal.errors import CellError
 from hal.panel import Panel
@@ -33,6 +35,8 @@ PATHS = {
 }  # fmt: skip
 MODELS = {"arm_model": ("arm", "arm"), "scanner_model": ("range_scanner", "range_scanner")}
 UNAUTHENTICATED = 401
+T = TypeVar("T")
+V = TypeVar("V")
 ON_DEMAND = ("arm_model", "scanner_model", "mission_files", "rounds", "review")
 
 
@@ -45,6 +49,10 @@ class Person:
 
 
 ANYBODY = Person(name=None, role=Role.MAINTAINER)
+
+
+def _panel_of(plain: Any) -> Panel:
+    return Panel.model_validate_json(json.dumps(plain))
 
 
 class Mirror:
@@ -70,7 +78,7 @@ class Mirror:
         self._looked_s = time.monotonic()
         self._wanted_s: dict[str, float] = {}
         self._followers: dict[str, asyncio.Task[None]] = {}
-        self._panel: tuple[Any, Panel] | None = None
+        self._computed: dict[str, tuple[Any, Any]] = {}
         self._robot: dict[str, Any] | None = None
         self._robot_wanted_s = -IDLE_S
         self._loops: list[asyncio.Task[None]] = []
@@ -133,13 +141,15 @@ class Mirror:
     def panel(self) -> Panel | None:
         """The panel of the cell; None until the service has answered."""
         plain = self.said("panel")
-        if plain is None:
-            return None
-        if self._panel is None or self._panel[0] is not plain:
-            import json
+        return None if plain is None else self.computed("panel", plain, _panel_of)
 
-            self._panel = (plain, Panel.model_validate_json(json.dumps(plain)))
-        return self._panel[1]
+    def computed(self, name: str, said: T, compute: Callable[[T], V]) -> V:
+        """Return what a function makes of something said, computed once for all pages until something else is said."""
+        kept = self._computed.get(name)
+        if kept is None or kept[0] is not said:
+            self._computed[name] = kept = (said, compute(said))
+        result: V = kept[1]
+        return result
 
     @property
     def tasks(self) -> list[dict[str, Any]]:

@@ -3,8 +3,9 @@
 Starts `panelwright serve` and headless Chromium, and measures: from a click to the value on the page without the time of the
 reading; the event loop of the service and its stops beside a mission with ten browsers; how many places of a moving arm reach ten
 browsers that show the cell in 3-D; how soon a page is painted and of use; axe violations over all pages; clicks for four jobs; and
-missions that a killed console harms (half an hour, because its pauses grow). Prints a table with the pass lines, and returns 1 if
-one is missed. `--only latency,crowd,scene,paint,axe,clicks,kills` chooses.
+missions that a killed console harms (half an hour, because its pauses grow). The browsers stand for other machines and get what
+this one has left, unless `--as-equals` is given. Prints a table with the pass lines, and returns 1 if one is missed.
+`--only latency,crowd,scene,paint,axe,clicks,kills` chooses.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from websockets.sync.client import connect
 
 from benchmarks.console_jobs import JOBS
 from benchmarks.console_served import CHROMIUM_OF_OTHERS, FINAL, Served, new_page, served, until
-from tests.service.browser import CONSOLE_PAGES, FLAGS
+from tests.service.browser import CHROMIUM, CONSOLE_PAGES, FLAGS
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES, SCHEMES = ((1440, 900), (390, 844)), ("light", "dark")
@@ -72,12 +73,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--stops", type=int, default=200)
     parser.add_argument("--only", default=",".join(PARTS))
+    parser.add_argument(
+        "--as-equals", action="store_true", help="browsers take turns with the service, as programs of this machine"
+    )
     parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
     given = parser.parse_args(arguments)
     lines: list[Line] = []
     print(f"load {os.getloadavg()[0]:.1f} at the start")
     with served(given.cell) as service, sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=str(CHROMIUM_OF_OTHERS), args=FLAGS)
+        program = CHROMIUM if given.as_equals else CHROMIUM_OF_OTHERS
+        browser = play.chromium.launch(executable_path=str(program), args=FLAGS)
         service.end("/v1/missions", {"file": "inspect"})
         for part in given.only.split(","):
             print(f"{part} ...", flush=True)

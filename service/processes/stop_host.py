@@ -19,6 +19,7 @@ from service.processes.child import Child
 from service.processes.latch import UNREADABLE, Latch, LatchState, StopLevel
 from service.processes.stop import StopServer
 
+MID_WRITE_S = 0.02  # a latch that is unreadable for longer has lost its writer; a stop waits no longer for it
 STOP_ANSWER_S = 0.5  # after this, the latch is set from this process
 RESET_ANSWER_S = 5.0  # generous, because a busy machine answers late
 READY_S = 20.0
@@ -143,10 +144,10 @@ class ProcessStop:
 
     def stop(self, source: str, level: StopLevel = StopLevel.OFF) -> LatchState:
         """Latch the stop through the stop process, or directly when that does not answer."""
-        count = self._readable(STOP_ANSWER_S).count
+        before = self._readable(MID_WRITE_S)
         command = "hold" if level is StopLevel.HOLD else "stop"
         is_told = self._child.is_alive() and self._child.write_line(f"{command} {_line(source)}")
-        if not (is_told and self._has_changed(count, STOP_ANSWER_S)):
+        if before == UNREADABLE or not (is_told and self._has_changed(before.count, STOP_ANSWER_S)):
             self._latch.set(source, level)
         return self._latch.state()
 

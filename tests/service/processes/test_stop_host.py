@@ -163,3 +163,17 @@ def test_a_writer_that_loses_its_processor_in_mid_write_refuses_no_reset_and_ack
     assert host.reset("test", seen_count=count)
     mid_write = iter([True] * unreadable)
     assert host.stop("another person").source == "another person"
+
+
+def test_a_latch_whose_writer_hangs_in_mid_write_is_set_directly(
+    latch: Latch, host: ProcessStop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_here: list[str] = []
+    os.kill(_pid(host), signal.SIGSTOP)
+    monkeypatch.setattr(
+        "service.processes.stop_host.STOP_ANSWER_S", 60.0
+    )  # so that waiting for the process would time out
+    monkeypatch.setattr(latch, "state", lambda: UNREADABLE)
+    monkeypatch.setattr(latch, "set", lambda source, _level: set_here.append(source))
+    host.stop("a person")
+    assert set_here == ["a person"]

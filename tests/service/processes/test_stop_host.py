@@ -156,12 +156,16 @@ def test_a_writer_that_loses_its_processor_in_mid_write_refuses_no_reset_and_ack
     unreadable: int, latch: Latch, host: ProcessStop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A record that could not be read counted as a change: resets that were done were said to be refused."""
-    read, mid_write = latch.state, iter([True] * unreadable)
+    read, write, mid_write = latch.state, host._child.write_line, [True] * unreadable
     count = host.stop("a person").count
-    assert latch.is_set()
-    monkeypatch.setattr(latch, "state", lambda: UNREADABLE if next(mid_write, False) else read())
+
+    def tell(line: str) -> bool:
+        mid_write.extend([True] * unreadable)
+        return write(line)
+
+    monkeypatch.setattr(host._child, "write_line", tell)
+    monkeypatch.setattr(latch, "state", lambda: UNREADABLE if mid_write and mid_write.pop() else read())
     assert host.reset("test", seen_count=count)
-    mid_write = iter([True] * unreadable)
     assert host.stop("another person").source == "another person"
 
 

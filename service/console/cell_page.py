@@ -21,7 +21,7 @@ from service.console.values import attribute
 FIELD_DEG = 48.0
 GRID = (4, 40)  # side, m, and divisions
 SKY = "#eef2f5"
-DRAWN_S = 0.05
+DRAWN_S = 0.02  # shorter than from one state of the robot to the next, so that none is passed over
 
 
 def install(place: Place) -> None:

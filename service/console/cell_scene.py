@@ -108,13 +108,18 @@ class CellScene:
         self._scene = scene
         self._mirror = mirror
         self._parts: dict[str, tuple[Any, list[Any]]] = {}
+        self._said: tuple[Any, int] | None = None
         self._links: list[DrawnLink] | None = None
         self._force: list[float] | None = None
         self._arrow: tuple[Any, Any] | None = None
         self._arm_parts: list[tuple[Any, Any]] = []
 
     def renew(self) -> None:
-        """Draw again what has changed."""
+        """Draw again what has changed; does nothing while the service has said nothing new."""
+        said = (self._mirror.robot, self._mirror.version)
+        if self._said is not None and said[0] is self._said[0] and said[1] == self._said[1]:
+            return
+        self._said = said
         with self._scene.together():
             self._renew()
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from drivers.transport.link import Cancellable, LinkLost, WireError
 from hal.errors import CellError
+from hal.priorities import ask_for_realtime
 
 log = logging.getLogger(__name__)
 
@@ -133,16 +133,3 @@ class Port(Generic[L]):
         finally:
             self._held = None
             link.close()
-
-
-def ask_for_realtime(priority: int) -> bool:
-    """Request real-time scheduling for the calling thread; return whether the system allowed it.
-
-    Linux requires CAP_SYS_NICE or an rtprio limit. Threads and processes started by this thread do not inherit it.
-    """
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
-    except (AttributeError, OSError) as error:
-        log.info("no real-time priority for %s: %s", threading.current_thread().name, error)
-        return False
-    return True

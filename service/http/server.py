@@ -11,6 +11,7 @@ from types import FrameType
 import uvicorn
 from starlette.types import ASGIApp
 
+from hal.priorities import Priority, take_priority
 from service.http.load import Load, limited_protocol
 
 GRACE_S = 2
@@ -75,6 +76,7 @@ class HttpServer:
 
     def run(self) -> None:
         """Serve in this thread, which must be the main thread, until a signal or `stop`."""
+        take_priority(Priority.ANSWERS)
         self._server.run(sockets=self._listeners)
 
     def start(self) -> None:

@@ -51,6 +51,29 @@ def test_a_client_is_nicer_than_its_parent() -> None:
     assert os.getpriority(os.PRIO_PROCESS, 0) == niceness
 
 
+@pytest.mark.parametrize(("priority", "asked"), [(Priority.STOP, 2), (Priority.ANSWERS, 1)])
+def test_stop_and_answers_are_real_time_where_that_is_allowed_and_else_keep_their_turns(
+    priority: Priority, asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[int, int, int]] = []
+    is_allowed = True
+
+    def schedule(pid: int, policy: int, param: os.sched_param) -> None:
+        calls.append((pid, policy, param.sched_priority))
+        if not is_allowed:
+            raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    plain = niceness_and_turn_s()
+    assert in_a_thread(priority) == plain
+    is_allowed = False
+    niceness, turn_s = in_a_thread(priority)
+    assert calls == [(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, asked)] * 2
+    may_be_first = os.geteuid() == 0
+    assert niceness == (plain[0] - 10 if priority is Priority.STOP and may_be_first else plain[0])
+    assert turn_s == (pytest.approx(0.0001) if priority is Priority.STOP and plain[1] else plain[1])
+
+
 def test_a_process_that_leads_a_session_gives_it_its_niceness_and_another_does_not() -> None:
     program = "from hal.priorities import *; take_priority(Priority.CLIENT); print(SESSION.read_text())"
     try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -11,6 +13,7 @@ import httpx2
 import pytest
 
 from hal.errors import CellError
+from hal.priorities import Priority, take_priority
 from service.errors import Busy
 from service.http.load import Load
 from service.serve import Panelwright
@@ -168,3 +171,11 @@ def test_what_computes_waits_for_its_modules_and_nothing_else_does(served: Panel
         finally:
             served.is_loaded.set()
         assert waiting.result(30.0).status_code == 200
+
+
+@pytest.mark.usefixtures("served")
+def test_the_event_loop_is_real_time_where_that_is_allowed() -> None:
+    with ThreadPoolExecutor(1) as other:
+        wanted = other.submit(lambda: take_priority(Priority.ANSWERS) or os.sched_getscheduler(0)).result()
+    loops = [thread.native_id for thread in threading.enumerate() if thread.name == "http"]
+    assert {os.sched_getscheduler(loop) for loop in loops if loop} == {wanted}

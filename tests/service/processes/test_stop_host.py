@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 from hal.child_python import module_command
 from hal.errors import MotionRefused
+from hal.priorities import Priority, take_priority
 from manipulation.control.way_back import LONGEST_S
 from service.processes import cell, stop
 from service.processes.beat import Beat, every_beat
@@ -42,6 +44,12 @@ def test_a_stop_process_that_hangs_keeps_nobody_from_stopping(latch: Latch, host
     os.kill(_pid(host), signal.SIGSTOP)
     assert host.stop("a person").is_latched
     assert latch.is_set()
+
+
+def test_the_stop_process_is_real_time_where_that_is_allowed(host: ProcessStop) -> None:
+    with ThreadPoolExecutor(1) as other:
+        wanted = other.submit(lambda: take_priority(Priority.STOP) or os.sched_getscheduler(0)).result()
+    eventually(lambda: os.sched_getscheduler(_pid(host)) == wanted)
 
 
 def test_the_death_of_the_stop_process_latches_the_stop_even_if_nobody_watches_its_heartbeat(
@@ -174,9 +182,7 @@ def test_a_latch_whose_writer_hangs_in_mid_write_is_set_directly(
 ) -> None:
     set_here: list[str] = []
     os.kill(_pid(host), signal.SIGSTOP)
-    monkeypatch.setattr(
-        "service.processes.stop_host.STOP_ANSWER_S", 60.0
-    )  # so that waiting for the process would time out
+    monkeypatch.setattr("service.processes.stop_host.STOP_ANSWER_S", 60.0)  # so that a stop that waits times out
     monkeypatch.setattr(latch, "state", lambda: UNREADABLE)
     monkeypatch.setattr(latch, "set", lambda source, _level: set_here.append(source))
     host.stop("a person")

@@ -38,6 +38,35 @@
     for (const one of document.querySelectorAll("[data-row]")) one.classList.toggle("old", nowS - Number(one.dataset.row) > staleS);
   }, 500);
 })();
+// Draws the cell in 3-D anew only where a message or the camera may have changed it; drawing it all the time takes half a processor.
+(() => {
+  const AFTER_MESSAGE_MS = 300, AT_LEAST_EVERY_MS = 1000;
+  const thrifty = new WeakSet();
+  let messageMs = 0;
+  function spare(renderer) {
+    const draw = renderer.render.bind(renderer);
+    let drawnMs = -AT_LEAST_EVERY_MS, drawnView = "";
+    renderer.render = (things, camera) => {
+      const nowMs = performance.now();
+      const view = [...camera.position, ...camera.quaternion, ...camera.projectionMatrix.elements].join();
+      const isSame = view === drawnView && nowMs > messageMs + AFTER_MESSAGE_MS;
+      if (isSame && nowMs < drawnMs + AT_LEAST_EVERY_MS) return;
+      draw(things, camera);
+      [drawnMs, drawnView] = [nowMs, view];
+    };
+    thrifty.add(renderer);
+  }
+  function look() {
+    for (const box of document.querySelectorAll(".scene")) {
+      const renderer = window.getElement(Number(box.id.slice(1)))?.renderer;
+      if (!renderer || thrifty.has(renderer)) continue;
+      if (messageMs === 0) window.socket.onAny(() => (messageMs = performance.now()));
+      messageMs = performance.now();
+      spare(renderer);
+    }
+  }
+  setInterval(look, 500);
+})();
 // Ends the session with the service, then shows the log-in page.
 document.addEventListener("click", async (event) => {
   if (!event.target.closest("#log-out")) return;

@@ -100,6 +100,18 @@ def test_the_cell_shows_the_planned_way_the_force_and_the_points_of_the_scanner(
     assert "The green way" not in page.inner_text(".main"), "the arm has moved since it was planned"
 
 
+def test_the_cell_is_drawn_anew_only_where_something_may_have_changed(page: Any, cell: Cell) -> None:
+    page.goto(f"{cell.url}/cell")
+    scene = "getElement(Number(document.querySelector('.scene').id.slice(1)))"
+    five_draws = f"""(() => {{ const {{ renderer, scene, camera }} = {scene}, before = renderer.info.render.frame;
+      for (let k = 0; k < 5; k += 1) {{ CHANGE; renderer.render(scene, camera); }}
+      return renderer.info.render.frame - before; }})()"""
+    until(page, f"{five_draws.replace('CHANGE', '')} <= 1")
+    assert page.evaluate(five_draws.replace("CHANGE", "camera.position.x += 0.01")) == 5
+    messages = "window.socket.listenersAny().forEach(told => told('update', {}))"
+    assert page.evaluate(five_draws.replace("CHANGE", messages)) == 5
+
+
 def test_readings_are_reviewed_by_keys_one_after_the_other(page: Any, cell: Cell) -> None:
     history = cell.service.service.plant.history
     asked = {"object": "setpoint", "kind": "slider", "unit": "%", "sigma": 2.0, "confidence": 0.4, "doubt": "it is dim"}

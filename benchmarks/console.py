@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 from websockets.sync.client import connect
 
 from benchmarks.console_jobs import JOBS
@@ -49,11 +49,14 @@ SEEN_IN_DIALOG = f"""() => {{ window.seenMs = window.clickMs = null; const befor
   const look = () => {{ if ({FACTS} !== before) window.seenMs = Date.now(); else requestAnimationFrame(look); }};
   look(); }}"""
 PAINT = """() => ({ first: performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? null })"""
-COUNT_MOVES = """() => { window.moves = {};
-  window.socket.onAny((event, said) => { for (const [, id] of (said?.code ?? '').matchAll(/"move", ?\\["([^"]+)"/g))
-    window.moves[id] = (window.moves[id] ?? 0) + 1; }); }"""
+COUNT_MOVES = """if (!window.moves) window.socket.onAny((event, said) => {
+  for (const [, id] of (said?.code ?? '').matchAll(/"move", ?\\["([^"]+)"/g))
+    window.moves[id] = (window.moves[id] ?? 0) + 1; });
+  window.moves = {};"""
+DRAW_NOTHING = "getElement(Number(document.querySelector('.scene').id.slice(1))).renderer.render = () => {};"
 MOST_MOVED = "Math.max(0, ...Object.values(window.moves))"  # the end of the arm moves with every place of it
-DRAWN_DIGITS, LEAST_SAMPLES = 3, 10  # the drawing is rounded to a millimetre
+DRAWN_DIGITS, LEAST_SAMPLES = 3, 30  # the drawing is rounded to a millimetre
+MISSIONS_IN_3D = 4
 USABLE = (
     "document.querySelector('#stop-box')?.dataset.latched === 'no' && document.querySelector('g[data-object]') !== null"
 )
@@ -160,25 +163,31 @@ def scene(service: Served, browser: Browser, _given: argparse.Namespace) -> Iter
         page.goto(service.console_url + "/cell")
         until(page, "window.did_handshake && document.body.textContent.includes('Contact force')")
     pages[0].wait_for_timeout(5000)  # all of them have drawn the cell
-    for page in pages:
-        page.evaluate(COUNT_MOVES)
-    with _samples(service) as samples:
-        task = service.end("/v1/missions", {"file": "inspect"})
-    pages[0].wait_for_timeout(1000)
-    ends_m = np.round([from_json(sample["base_from_flange"]).translation for sample in samples], DRAWN_DIGITS)
-    moved = int(np.count_nonzero(np.diff(ends_m, axis=0).any(axis=1)))
-    received = [int(page.evaluate(MOST_MOVED)) for page in pages]
+    for where, change in (("here", ""), ("elsewhere", DRAW_NOTHING)):
+        for page in pages:
+            page.evaluate(f"() => {{ {change} {COUNT_MOVES} }}")
+        moved = _moves(service, pages[0])
+        share = min(int(page.evaluate(MOST_MOVED)) for page in pages) / moved
+        yield Line(
+            what=f"cell in 3-D: share of {moved} places that reach each of {BROWSERS} browsers that draw {where}, least",
+            measured=f"{share:.2f}",
+            wanted="0.97",
+            is_met=share >= 0.97,
+        )
     for page in pages:
         page.context.close()
-    if task["state"] != "succeeded" or moved < LEAST_SAMPLES:
-        raise RuntimeError(f"the arm moved in {moved} samples only: {task['problem']}")
-    share = min(received) / moved
-    yield Line(
-        what=f"cell in 3-D: share of {moved} places of the arm that reach each of {BROWSERS} browsers, least",
-        measured=f"{share:.2f}",
-        wanted="0.97",
-        is_met=share >= 0.97,
-    )
+
+
+def _moves(service: Served, page: Page) -> int:
+    """Let the arm move, wait until all of it was told, and return by how many places the stream says it went."""
+    with _samples(service) as samples:
+        tasks = [service.end("/v1/missions", {"file": "inspect"}) for _ in range(MISSIONS_IN_3D)]
+    page.wait_for_timeout(1000)
+    ends_m = np.round([from_json(sample["base_from_flange"]).translation for sample in samples], DRAWN_DIGITS)
+    moved = int(np.count_nonzero(np.diff(ends_m, axis=0).any(axis=1)))
+    if moved < LEAST_SAMPLES or any(task["state"] != "succeeded" for task in tasks):
+        raise RuntimeError(f"the arm went to {moved} places only: {[task['problem'] for task in tasks]}")
+    return moved
 
 
 @contextmanager

@@ -198,6 +198,7 @@ class Panelwright:
             assert self._server is not None  # noqa: S101 - narrowing: `_begin` made it
             self._server.run()
         finally:
+            _ignore_signals()  # a second Ctrl-C must not cut off the end, which takes a bounded time
             self.close()
         if self._error is not None:
             raise self._error
@@ -337,3 +338,8 @@ def _shipped() -> Mapping[str, Operation]:
     from service.operations import OPERATIONS
 
     return OPERATIONS
+
+
+def _ignore_signals() -> None:
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, signal.SIG_IGN)

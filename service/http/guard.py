@@ -88,26 +88,35 @@ class RequestGuard:
             await send({"type": "websocket.close", "code": 1013, "reason": too_many})
             return
         if too_many is not None:
-            self._count(503)
-            again = {"Retry-After": "1"}
-            busy = problem_response(503, "busy", too_many, hint="wait for their end", retry=Retry.SAFE, headers=again)
-            await busy(scope, receive, send)
+            await self._refuse_now("busy", too_many, "wait for their end")(scope, receive, send)
             return
         with self.load.request(client):
-            await self._until_loaded(scope["path"])
-            await self._pass_on(scope, receive, send)
+            if await self._is_loaded_for(scope["path"]):
+                await self._pass_on(scope, receive, send)
+            else:
+                ends = "the service ends before it has loaded what this request needs"
+                await self._refuse_now("ending", ends, "start the service again")(scope, receive, send)
+
+    def _refuse_now(self, code: str, detail: str, hint: str) -> ASGIApp:
+        self._count(503)
+        return problem_response(503, code, detail, hint=hint, retry=Retry.SAFE, headers={"Retry-After": "1"})
 
     async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
         with LimitedBody(receive, self.load, most_bytes=_most_bytes(scope)) as body:
             takes = receive if scope["type"] == "websocket" else body.receive
             await self._app(scope, takes, self._sender(send))
 
-    async def _until_loaded(self, path: str) -> None:
-        """Let a request that may compute wait at the start, because modules and kernels must not load in two threads at once."""
+    async def _is_loaded_for(self, path: str) -> bool:
+        """Let a request that may compute wait at the start, because modules and kernels must not load in two threads at once.
+
+        Returns:
+            Whether it may go on; False where the service ends before that.
+        """
         if path.startswith(PROMPT) or not path.startswith("/v1/"):
-            return
-        while not self._is_loaded():  # noqa: ASYNC110 - another thread loads
+            return True
+        while not self._is_loaded() and not self.load.is_ending:  # noqa: ASYNC110 - another thread loads
             await asyncio.sleep(LOADED_LOOK_S)
+        return self._is_loaded()
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str, str] | None:
         if self._allowed.proxies is not None and not scope[PROXIED] and not _is_of_this_machine(scope):

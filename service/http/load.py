@@ -28,13 +28,14 @@ class Load:
 
     Attributes:
         body_bytes: bytes of bodies in memory.
+        is_ending: whether the server ends.
     """
 
     def __init__(self) -> None:
         self.body_bytes = 0
         self._loop: asyncio.AbstractEventLoop | None = None
         self._limits: set[asyncio.Timeout] = set()
-        self._is_ending = False
+        self.is_ending = False
         self._running: Counter[str] = Counter()
         self._open: set[LimitedProtocol] = set()
         self._waiting: dict[LimitedProtocol, None] = {}  # for a head; the longest wait first
@@ -56,7 +57,7 @@ class Load:
             TimeoutError: the time is over, or the server ends.
         """
         self._loop = asyncio.get_running_loop()
-        async with asyncio.timeout(0.0 if self._is_ending else max(0.0, left_s)) as limit:
+        async with asyncio.timeout(0.0 if self.is_ending else max(0.0, left_s)) as limit:
             self._limits.add(limit)
             try:
                 yield
@@ -65,7 +66,7 @@ class Load:
 
     def end(self) -> None:
         """Refuse bodies that have not arrived yet, because the server ends; may be called from any thread."""
-        self._is_ending = True
+        self.is_ending = True
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._end_bodies)
 

@@ -25,7 +25,9 @@ class _Server(uvicorn.Server):
         self._on_exit = on_exit
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Handle SIGINT and SIGTERM; called by uvicorn."""
+        """Handle the first SIGINT or SIGTERM; called by uvicorn, which would cut off all answers at a second one."""
+        if self.should_exit:
+            return
         self._on_exit("Ctrl-C" if sig == 2 else f"signal {sig}")
         super().handle_exit(sig, frame)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -227,6 +228,16 @@ def test_no_end_of_the_service_leaves_an_orphan(served_alone: Served, how: signa
     assert "Exception" not in served_alone.log.read_text(), "the upload that was cut is no defect"
     assert "Traceback" not in served_alone.log.read_text()
     assert (how is signal.SIGKILL) is ("processes ended" not in served_alone.log.read_text())
+
+
+def test_ctrl_c_again_and_again_cuts_nothing_of_the_end_off(served_alone: Served) -> None:
+    while _runs(served_alone.process):
+        os.kill(served_alone.process.pid, signal.SIGINT)
+        with contextlib.suppress(psutil.TimeoutExpired):
+            served_alone.process.wait(0.05)
+    eventually(lambda: not served_alone.survivors())
+    assert "Traceback" not in served_alone.log.read_text()
+    assert "processes ended" in served_alone.log.read_text()
 
 
 def test_ctrl_c_ends_open_streams_too(served_alone: Served) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 import threading
@@ -11,10 +12,12 @@ from contextlib import ExitStack, contextmanager
 
 import httpx2
 import pytest
+from fastapi import FastAPI
 
 from hal.errors import CellError
 from hal.priorities import Priority, take_priority
 from service.errors import Busy
+from service.http.guard import Allowed, RequestGuard
 from service.http.load import Load
 from service.serve import Panelwright
 from tests.service.verbs import HoldRequest
@@ -171,6 +174,23 @@ def test_what_computes_waits_for_its_modules_and_nothing_else_does(served: Panel
         finally:
             served.is_loaded.set()
         assert waiting.result(30.0).status_code == 200
+
+
+def test_what_waits_for_its_modules_is_refused_when_the_service_ends() -> None:
+    counted: list[int] = []
+    allowed = Allowed(hosts=frozenset({"127.0.0.1"}), origins=frozenset())
+    guard = RequestGuard(FastAPI(), allowed=allowed, count=counted.append, is_loaded=lambda: False)
+
+    async def asked_before_the_end() -> httpx2.Response:
+        transport = httpx2.ASGITransport(app=guard)
+        async with httpx2.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            waiting = asyncio.create_task(client.get("/v1/knowledge"))
+            await asyncio.sleep(0)
+            guard.load.end()
+            return await waiting
+
+    answer = asyncio.run(asked_before_the_end())
+    assert (answer.status_code, answer.json()["title"], counted) == (503, "Ending", [503])
 
 
 @pytest.mark.usefixtures("served")

@@ -148,7 +148,7 @@ def refused(reason: str, *, unit: str = "") -> PatchReading:
     return PatchReading(reason=reason, unit=unit)
 
 
-def doubted(status: PatchReading, reason: str) -> PatchReading:
+def doubted(status: A, reason: str) -> A:
     """Return a refusal with that reason, with the status as its guess."""
     return answer_at(limited(status, MOST_DOUBTED), ANSWER_AT, reason)
 
@@ -215,6 +215,6 @@ def probability(evidence: Sequence[tuple[float, float, float]]) -> float:
     return float(1.0 / (1.0 + np.exp(-total)))
 
 
-def limited(status: PatchReading, most: float) -> PatchReading:
+def limited(status: A, most: float) -> A:
     """Return the status with a confidence of at most `most`."""
     return status if status.confidence <= most else replace(status, confidence=most)

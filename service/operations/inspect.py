@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,13 +12,14 @@ from hal.arrays import Array
 from hal.devices import DeviceKind
 from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
-from hal.panel import PanelObject
+from hal.panel import PanelObject, Toggle
 from manipulation import visiting_order
 from perception.vision import (
     CameraProjection,
     ObjectReading,
     PanelProjection,
     answer_at,
+    doubted,
     draw_annotated,
     merge_views,
     said,
@@ -38,6 +39,7 @@ from service.schema.requests import InspectRequest, RecogniseRequest
 from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
+TURNED = "an earlier look showed the other state: look from the side, where the bat is not seen from its end"
 MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
@@ -135,7 +137,22 @@ def _upright_drawing(view: Look, readings: Iterable[ObjectReading], turns: int) 
 
 def inspect_close(session: Session, names: Collection[str]) -> Inspection:
     """Read objects from close-ups, and those that cannot be read there from the sides."""
-    return look_past(session, close_ups(session, names))
+    before = session.world.readings
+    return look_past(session, _doubting_turned_bats(session, before, close_ups(session, names)))
+
+
+def _doubting_turned_bats(session: Session, before: Mapping[str, ObjectReading], found: Inspection) -> Inspection:
+    """Refuse the toggles that an earlier look showed in their other state, because a bat seen from its end deceives."""
+    deceptive = {
+        name: doubted(reading, TURNED)
+        for name, reading in found.readings.items()
+        if isinstance(session.panel.object(name), Toggle) and _contradicts(before.get(name), reading)
+    }
+    return replace(found, readings=found.readings | deceptive)
+
+
+def _contradicts(before: ObjectReading | None, now: ObjectReading) -> bool:
+    return before is not None and now.answered and before.state not in (None, now.state)
 
 
 def close_ups(session: Session, names: Collection[str]) -> Inspection:

@@ -63,6 +63,16 @@ def test_a_display_behind_a_cable_is_read_from_the_side(session: Session, monkey
     assert session.world.readings["temperature"] is reading
 
 
+def test_a_toggle_that_an_earlier_look_showed_in_its_other_state_is_looked_at_from_the_side(session: Session) -> None:
+    straight = close_ups(session, ("pump",)).readings["pump"]
+    other = {"on": "off", "off": "on"}[str(straight.state)]
+    session.world.note_readings([replace(straight, state=other)])
+    found = inspect_close(session, ("pump",))
+    assert found.readings["pump"].state == truth_of(session, "pump").state
+    assert found.pictures[-1].title == "pump from the right"
+    assert len(inspect_close(session, ("pump",)).pictures) == 1, "the looks agree now"
+
+
 def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise Unreachable("no way there", hint="none")

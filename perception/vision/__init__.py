@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from perception.vision.photographs.reader import PhotographKind, read_photograph
     from perception.vision.projection import CameraProjection, PanelProjection
     from perception.vision.quadrangle import estimate
-    from perception.vision.reading import ObjectReading, answer_at, doubted
+    from perception.vision.reading import ObjectReading, answer_at
     from perception.vision.registration.outline import contour_m
     from perception.vision.registration.rims import RimView, find_rims
     from perception.vision.warm import warm_up
@@ -50,7 +50,6 @@ __all__ = [
     "compare",
     "contour_m",
     "decode",
-    "doubted",
     "draw_annotated",
     "draw_outlines",
     "estimate",

@@ -142,6 +142,10 @@ class ObjectReading(Answer):
         """Return the object as present, with the reading `status`."""
         return replace(self, present=True, **{field.name: getattr(status, field.name) for field in fields(Answer)})
 
+    def in_doubt(self, reason: str) -> ObjectReading:
+        """Return the object as refused for that reason, with its reading as the guess."""
+        return doubted(self, reason)
+
 
 def refused(reason: str, *, unit: str = "") -> PatchReading:
     """Return a refusal without a guess; `reason` states the cause, then what would help."""

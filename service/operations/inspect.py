@@ -19,7 +19,6 @@ from perception.vision import (
     ObjectReading,
     PanelProjection,
     answer_at,
-    doubted,
     draw_annotated,
     merge_views,
     said,
@@ -144,7 +143,7 @@ def inspect_close(session: Session, names: Collection[str]) -> Inspection:
 def _doubting_turned_bats(session: Session, before: Mapping[str, ObjectReading], found: Inspection) -> Inspection:
     """Refuse the toggles that an earlier look showed in their other state, because a bat seen from its end deceives."""
     deceptive = {
-        name: doubted(reading, TURNED)
+        name: reading.in_doubt(TURNED)
         for name, reading in found.readings.items()
         if isinstance(session.panel.object(name), Toggle) and _contradicts(before.get(name), reading)
     }

@@ -33,7 +33,7 @@ class Priority(Enum):
 
     0.1 ms is the shortest turn that Linux gives. Beside a load of 12 on two cores, a control thread at 125 Hz then sent 7 of
     100 set-points late instead of 11; turns of 1 ms changed nothing, nor did more niceness of the service. Ten browsers on the
-    same two cores let the event loop lag 60 ms and a stop take 12 ms (99th percentiles); real-time made that 13 and 3 ms.
+    same two cores let the event loop lag 60 ms and a stop take 12 ms (99th percentiles); real-time made that 6 to 21 and 2 ms.
     """
 
     CONTROL = (0, 0.0001, 0)  # the control thread, which has a deadline in every period

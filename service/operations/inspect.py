@@ -147,6 +147,8 @@ def _doubting_turned_bats(session: Session, before: Mapping[str, ObjectReading],
         for name, reading in found.readings.items()
         if isinstance(session.panel.object(name), Toggle) and _contradicts(before.get(name), reading)
     }
+    for name in deceptive:
+        session.world.forget_reading(name)
     return replace(found, readings=found.readings | deceptive)
 
 

@@ -106,7 +106,8 @@ def served(cell: Path, *, runs: Path | None = None) -> Iterator[Served]:
         temporary.mkdir()
         environment = {**os.environ, "TMPDIR": str(temporary)}
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-        with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as process:
+        # It leads a session as under systemd, so that Linux gives its priority to all of it.
+        with subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True, **pipes) as process:
             assert process.stdout is not None
             told = ""
             while "console at" not in told:

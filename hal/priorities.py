@@ -21,6 +21,7 @@ from pathlib import Path
 # struct sched_attr of linux/sched/types.h: size, policy, flags, niceness, priority, runtime (ns), deadline, period
 ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 SESSION = Path("/proc/self/autogroup")
+SESSION_NICENESS = -10
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}  # numbers of the system call sched_setattr
 log = logging.getLogger(__name__)
 
@@ -60,6 +61,18 @@ def take_priority(priority: Priority) -> None:
     niceness = os.getpriority(os.PRIO_PROCESS, 0)
     attributes = ATTRIBUTES.pack(ATTRIBUTES.size, os.SCHED_OTHER, 0, niceness, 0, round(1e9 * turn_s), 0, 0)
     ctypes.CDLL(None).syscall(call, 0, attributes, 0)
+
+
+def raise_session() -> None:
+    """Let the session that this process leads come before those of other programs, if the system knows this and permits it.
+
+    Threads of one Python process wait for the one that computes, also those with a real-time priority. Beside ten browsers on the
+    same two cores, 30 of 1000 timers of the event loop were more than 10 ms late during a mission, and 17 of 1000 with this.
+    """
+    if os.getsid(0) != os.getpid():
+        return  # the session of a person's shell, in which much else may run
+    with suppress(OSError):
+        SESSION.write_text(str(SESSION_NICENESS))
 
 
 def ask_for_realtime(priority: int) -> bool:

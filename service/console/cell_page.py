@@ -21,7 +21,8 @@ from service.console.values import attribute
 FIELD_DEG = 48.0
 GRID = (4, 40)  # side, m, and divisions
 SKY = "#eef2f5"
-DRAWN_S = 0.02  # shorter than from one state of the robot to the next, so that none is passed over
+DRAWN_S = 0.25
+FRAMES_HZ = 30  # with the wait for the screen, which NiceGUI adds to each frame, 20 frames a second
 
 
 def install(place: Place) -> None:
@@ -34,11 +35,12 @@ def install(place: Place) -> None:
             ui.html(say("cell.heading"), sanitize=False, tag="h2")
             with ui.element("div").props(f'role="img" aria-label="{attribute(say("cell.scene"))}"'):
                 lens = ui.scene.perspective_camera(fov=FIELD_DEG)
-                scene = BatchedScene(width=1000, height=512, grid=GRID, camera=lens, background_color=SKY).classes(
-                    "scene"
-                )
+                scene = BatchedScene(
+                    width=1000, height=512, grid=GRID, camera=lens, background_color=SKY, fps=FRAMES_HZ
+                ).classes("scene")
             scene.move_camera(x=-0.75, y=-1.35, z=1.35, look_at_x=0.5, look_at_y=0.0, look_at_z=0.5, duration=0)
             drawn = CellScene(scene, mirror)
+            mirror.robot_told.subscribe(drawn.renew_arm)
             ui.timer(DRAWN_S, drawn.renew)
             if mirror.may(Role.OPERATOR):
                 button(say("cell.scan"), lambda: _show_points(mirror, drawn), look="plain")

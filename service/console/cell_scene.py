@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,10 +12,9 @@ from typing import Any
 import numpy as np
 from nicegui import json, ui
 from nicegui.awaitable_response import AwaitableResponse, NullResponse
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
-from hal.geometry import from_json
+from hal.geometry import from_json, skew
 from service.console.mirror import Mirror
 from service.console.poses import base_from, frames_of, lens_of
 
@@ -25,22 +25,30 @@ SIGMAS_SHOWN = 3.0 * 10.0  # three standard deviations, ten times enlarged
 ARM, PLATE, VIEW, HAZE = "#2f6fd0", "#8894a0", "#e08600", "#c03a78"
 FORCE, WAY, PLACE, POINTS = "#b3150d", "#1d7a4c", "#0f5132", (0.35, 0.2, 0.6)
 FORCE_M_PER_N = 0.01
+PARALLEL = 1e-9
 LEAST_N = 1.0  # less is the noise of a force sensor that touches nothing
 SHAFT_M, HEAD_M, HEAD_LONG_M = 0.008, 0.02, 0.05
 STATION_M, POINT_M = 0.015, 0.004
 
 
-def joint_frames(links: list[dict[str, float]], position_rad: list[float]) -> list[RigidTransform]:
-    """Return base_from_link of each link, base first, by the Denavit-Hartenberg parameters of the arm.
+def joint_frames(links: list[dict[str, float]], position_rad: list[float]) -> list[Array]:
+    """Return base_from_link (4, 4) of each link, base first, by the Denavit-Hartenberg parameters of the arm.
 
     The rows are those of `hal.devices.DhLink`: turn by the joint about z, shift d along z, shift a along x, turn alpha about x.
     """
-    frames = [RigidTransform.identity()]
+    frames = [np.eye(4)]
     for link, angle in zip(links, position_rad, strict=True):
-        turn = Rotation.from_euler("z", angle + link["offset_rad"])
-        about_z = RigidTransform.from_components([0.0, 0.0, link["d_m"]], turn)
-        along_x = RigidTransform.from_components([link["a_m"], 0.0, 0.0], Rotation.from_euler("x", link["alpha_rad"]))
-        frames.append(frames[-1] * about_z * along_x)
+        theta, alpha = angle + link["offset_rad"], link["alpha_rad"]
+        (c, s), (ca, sa) = (math.cos(theta), math.sin(theta)), (math.cos(alpha), math.sin(alpha))
+        link_from_next = np.array(
+            [
+                [c, -s * ca, s * sa, link["a_m"] * c],
+                [s, c * ca, -c * sa, link["a_m"] * s],
+                [0.0, sa, ca, link["d_m"]],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+        frames.append(frames[-1] @ link_from_next)
     return frames
 
 
@@ -59,20 +67,50 @@ class DrawnLink:
 
 def drawn_links(links: list[dict[str, float]], position_rad: list[float]) -> list[DrawnLink]:
     """Return where the links of an arm are drawn, rounded to a millimetre; arguments as for `joint_frames`."""
-    points = np.round([frame.translation for frame in joint_frames(links, position_rad)], 3)
+    points = np.round([frame[:3, 3] for frame in joint_frames(links, position_rad)], 3)
     return [_link(a, b) for a, b in itertools.pairwise(points)]
 
 
 def _link(a: Array, b: Array) -> DrawnLink:
     length_m = float(np.linalg.norm(b - a))
-    turn = along_y(b - a) if length_m > LEAST_ROD_M else None
+    turn = along_y((b - a) / length_m) if length_m > LEAST_ROD_M else None
     return DrawnLink(joint_m=b.tolist(), middle_m=((a + b) / 2).tolist(), length_m=length_m, turn=turn)
 
 
 def along_y(direction: Array) -> list[list[float]]:
-    """Return the rotation (3, 3) that brings a cylinder, which lies along y, into a direction."""
-    turn: list[list[float]] = Rotation.align_vectors([direction], [[0.0, 1.0, 0.0]])[0].as_matrix().tolist()
+    """Return the rotation (3, 3) that brings a cylinder, which lies along y, into a direction of length 1."""
+    if direction[1] < -1.0 + PARALLEL:
+        return [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+    axis = skew(np.cross([0.0, 1.0, 0.0], direction))
+    turn: list[list[float]] = (np.eye(3) + axis + axis @ axis / (1.0 + direction[1])).tolist()  # Rodrigues' formula
     return turn
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnForce:
+    """The arrow of a contact force: its shaft's length and middle, its head, m, and how both are turned (3, 3)."""
+
+    length_m: float
+    middle_m: list[float]
+    head_m: list[float]
+    turn: list[list[float]]
+
+
+def drawn_force(robot: dict[str, Any]) -> DrawnForce | None:
+    """Return the arrow of the contact force at the flange; None for a force that is only noise."""
+    size_n = math.hypot(*robot["wrench"][:3])
+    if size_n < LEAST_N:
+        return None
+    flange = from_json(robot["base_from_flange"])
+    along = flange.rotation.apply(robot["wrench"][:3]) / size_n
+    length_m = round(FORCE_M_PER_N * size_n, 3)
+    middle, head = (flange.translation + along * away_m for away_m in (length_m / 2, length_m + HEAD_LONG_M / 2))
+    return DrawnForce(
+        length_m=length_m,
+        middle_m=np.round(middle, 3).tolist(),
+        head_m=np.round(head, 3).tolist(),
+        turn=np.round(along_y(along), 2).tolist(),
+    )
 
 
 class BatchedScene(ui.scene):
@@ -108,28 +146,31 @@ class CellScene:
         self._scene = scene
         self._mirror = mirror
         self._parts: dict[str, tuple[Any, list[Any]]] = {}
-        self._said: tuple[Any, int] | None = None
+        self._version = -1
         self._links: list[DrawnLink] | None = None
-        self._force: list[float] | None = None
+        self._force: DrawnForce | None = None
         self._arrow: tuple[Any, Any] | None = None
         self._arm_parts: list[tuple[Any, Any]] = []
 
+    def renew_arm(self) -> None:
+        """Draw the arm and the force on it as the service told them last."""
+        with self._scene.together():
+            links = self._arm_links()
+            if links is not None and links != self._links:
+                self._links = links
+                self._arm(links)
+            self._draw_force()
+
     def renew(self) -> None:
-        """Draw again what has changed; does nothing while the service has said nothing new."""
-        said = (self._mirror.robot, self._mirror.version)
-        if self._said is not None and said[0] is self._said[0] and said[1] == self._said[1]:
+        """Draw again what has changed besides the arm; does nothing while the service has said nothing new."""
+        if self._version == self._mirror.version:
             return
-        self._said = said
+        self._version = self._mirror.version
         with self._scene.together():
             self._renew()
 
     def _renew(self) -> None:
         frames = frames_of(self._mirror)
-        links = self._arm_links()
-        if links is not None and links != self._links:
-            self._links = links
-            self._arm(links)
-        self._draw_force()
         planned = self._mirror.planned
         self._part("way", [] if planned is None else planned["result"]["plan"]["stations"], self._way)
         self._part("panel", frames.get("panel"), self._panel)
@@ -187,29 +228,22 @@ class CellScene:
                 rod.rotate_R(link.turn)
 
     def _draw_force(self) -> None:
-        """Draw the contact force at the flange as an arrow; it is made once and moved afterwards."""
+        """Draw the contact force as an arrow; it is made once, and moved or hidden afterwards."""
         robot = self._mirror.robot
-        if robot is None:
+        force = None if robot is None else self._mirror.computed("force", robot, drawn_force)
+        if force == self._force:
             return
-        flange = from_json(robot["base_from_flange"])
-        force_n = flange.rotation.apply(robot["wrench"][:3])
-        newest = np.round([*flange.translation, *force_n], 2).tolist()
-        if newest == self._force:
-            return
-        self._force = newest
-        size_n = float(np.linalg.norm(force_n))
+        self._force = force
         if self._arrow is None:
             with self._scene:
                 shaft = self._scene.cylinder(SHAFT_M, SHAFT_M, 1.0).material(FORCE)
                 self._arrow = (shaft, self._scene.cylinder(0.0, HEAD_M, HEAD_LONG_M).material(FORCE))
         shaft, head = self._arrow
         for part in self._arrow:
-            part.visible(size_n >= LEAST_N)
-        if size_n >= LEAST_N:
-            length_m, along = FORCE_M_PER_N * size_n, force_n / size_n
-            turn = along_y(along)
-            shaft.scale(1.0, length_m, 1.0).move(*(flange.translation + along * length_m / 2)).rotate_R(turn)
-            head.move(*(flange.translation + along * (length_m + HEAD_LONG_M / 2))).rotate_R(turn)
+            part.visible(force is not None)
+        if force is not None:
+            shaft.scale(1.0, force.length_m, 1.0).move(*force.middle_m).rotate_R(force.turn)
+            head.move(*force.head_m).rotate_R(force.turn)
 
     def _way(self, stations: list[dict[str, Any]]) -> list[Any]:
         """Draw the way of the flange through the stations of a plan, with a ball at each."""

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from nicegui import Event
+
 from hal.errors import CellError
 from hal.panel import Panel
 from service.access.keys import Role
@@ -65,6 +67,7 @@ class Mirror:
         problem: why the service could not be asked; None when it answers.
         events: events of a task by its id, from its beginning.
         version: rises whenever the service says something that it has not said before.
+        robot_told: fires with each state of the robot that the service streams; while a page follows it, the stream stays open.
     """
 
     def __init__(self, client: ServiceClient, *, person: Person = ANYBODY) -> None:
@@ -73,6 +76,7 @@ class Mirror:
         self.problem: CellError | None = None
         self.events: dict[str, list[dict[str, Any]]] = {}
         self.version = 0
+        self.robot_told: Event[[]] = Event()
         self._said: dict[str, Any] = {}
         self._due_s: dict[str, float] = {}
         self._looked_s = time.monotonic()
@@ -217,6 +221,7 @@ class Mirror:
                 async with contextlib.aclosing(self.client.robot()) as samples:
                     async for sample in samples:
                         self._robot = sample
+                        self.robot_told.emit()
                         if not self._wants_robot:
                             break
             self._robot = None
@@ -224,7 +229,7 @@ class Mirror:
 
     @property
     def _wants_robot(self) -> bool:
-        return time.monotonic() - self._robot_wanted_s < ROBOT_S
+        return bool(self.robot_told.callbacks) or time.monotonic() - self._robot_wanted_s < ROBOT_S
 
     def _take(self, readings: list[dict[str, Any]]) -> None:
         """Put new readings in the place of older ones of the same objects."""

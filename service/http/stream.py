@@ -50,8 +50,9 @@ class Sampler:
 
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
+        next_s = loop.time()
         while self._listeners:
-            next_s = loop.time() + 1.0 / RATE_HZ
+            next_s = max(next_s + 1.0 / RATE_HZ, loop.time())  # a late sample does not delay those after it
             text = await self._text()
             for mailbox in self._listeners:
                 if mailbox.full():

@@ -21,6 +21,7 @@ from hal.errors import CellError, ConfigError, DeviceError
 from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
 from hal.motion import CellSignals
+from hal.priorities import raise_session
 from hal.process_state import MOVES, set_memory_priority
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
@@ -276,6 +277,7 @@ def main() -> None:
     """Run the cell process; this is its entry point."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     sys.setswitchinterval(SWITCH_S)
+    raise_session()
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     set_memory_priority(MOVES)  # as its parent had it before it began to compute
     import hal.jit  # noqa: F401 - the simulated world needs it too, and takes it from here

@@ -11,7 +11,7 @@ import threading
 
 import pytest
 
-from hal.priorities import ATTRIBUTES, CALLS, SESSION, Priority, take_priority
+from hal.priorities import ATTRIBUTES, CALLS, SESSION, SESSION_NICENESS, Priority, take_priority
 
 pytestmark = pytest.mark.skipif(platform.machine() not in CALLS, reason="the system call is not known here")
 
@@ -74,18 +74,23 @@ def test_stop_and_answers_are_real_time_where_that_is_allowed_and_else_keep_thei
     assert turn_s == (pytest.approx(0.0001) if priority is Priority.STOP and plain[1] else plain[1])
 
 
-def test_a_process_that_leads_a_session_gives_it_its_niceness_and_another_does_not() -> None:
-    program = "from hal.priorities import *; take_priority(Priority.CLIENT); print(SESSION.read_text())"
+@pytest.mark.parametrize(
+    ("work", "given"), [("take_priority(Priority.CLIENT)", "5"), ("raise_session()", str(SESSION_NICENESS))]
+)
+def test_a_process_gives_its_niceness_to_the_session_that_it_leads_and_to_no_other(work: str, given: str) -> None:
+    program = f"from hal.priorities import *; {work}; print(SESSION.read_text())"
     try:
         own = SESSION.read_text()
     except OSError:
         pytest.skip("this system does not group sessions")
     if "nice" not in own:
         pytest.skip("this system does not group sessions")
+    if given.startswith("-") and os.geteuid() != 0:
+        pytest.skip("only a privileged process may raise its session")
     found = [
         subprocess.run(
             [sys.executable, "-c", program], start_new_session=is_leader, capture_output=True, text=True, check=True
         ).stdout.split()[-1]
         for is_leader in (True, False)
     ]
-    assert found == ["5", own.split()[-1]]
+    assert found == [given, own.split()[-1]]

@@ -39,19 +39,30 @@
   }, 500);
 })();
 // Draws the cell in 3-D anew only where a message or the camera may have changed it; drawing it all the time takes half a processor.
+// A drawing that takes long, for example without a graphics card, is followed by a pause of the same length: messages come first.
 (() => {
-  const AFTER_MESSAGE_MS = 300, AT_LEAST_EVERY_MS = 1000;
+  const AFTER_MESSAGE_MS = 300, AT_LEAST_EVERY_MS = 5000, FRAME_MS = 50;
   const thrifty = new WeakSet();
   let messageMs = 0;
   function spare(renderer) {
-    const draw = renderer.render.bind(renderer);
-    let drawnMs = -AT_LEAST_EVERY_MS, drawnView = "";
+    const draw = renderer.render.bind(renderer), graphics = renderer.getContext();
+    let drawnMs = -AT_LEAST_EVERY_MS, drawnView = "", fence = null, freeMs = 0;
+    function isBusy(nowMs) {
+      if (fence === null) return nowMs < freeMs;
+      if (graphics.getSyncParameter(fence, graphics.SYNC_STATUS) !== graphics.SIGNALED) return !graphics.isContextLost();
+      graphics.deleteSync(fence);
+      fence = null;
+      freeMs = nowMs + 3 * (nowMs - drawnMs - FRAME_MS);
+      return nowMs < freeMs;
+    }
     renderer.render = (things, camera) => {
       const nowMs = performance.now();
       const view = [...camera.position, ...camera.quaternion, ...camera.projectionMatrix.elements].join();
       const isSame = view === drawnView && nowMs > messageMs + AFTER_MESSAGE_MS;
-      if (isSame && nowMs < drawnMs + AT_LEAST_EVERY_MS) return;
+      if (isBusy(nowMs) || (isSame && nowMs < drawnMs + AT_LEAST_EVERY_MS)) return;
       draw(things, camera);
+      fence = graphics.fenceSync(graphics.SYNC_GPU_COMMANDS_COMPLETE, 0);
+      graphics.flush();
       [drawnMs, drawnView] = [nowMs, view];
     };
     thrifty.add(renderer);

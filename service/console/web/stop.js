@@ -15,6 +15,7 @@
   const PATIENCE_MS = 3000;
   let count = 0;
   let shownMs = 0;
+  let isDirect = false; // the stop process answered the page itself the last time; then the console is not asked as well
   let pending = 0; // presses that are not answered yet and could latch the stop again after a reset
 
   async function ask(url, method, body) {
@@ -36,9 +37,13 @@
 
   async function look() {
     const askedMs = performance.now();
+    const wasDirect = isDirect;
+    const direct = Promise.any(ways.map((url) => ask(url, "GET")));
+    direct.then(() => (isDirect = true), () => (isDirect = false));
     try {
-      show(await Promise.any([...ways, "/relay/stop"].map((url) => ask(url, "GET"))), askedMs);
+      show(await (wasDirect ? direct : Promise.any([direct, ask("/relay/stop", "GET")])), askedMs);
     } catch {
+      if (wasDirect) return look();
       tell("unknown", words.silent);
     }
   }

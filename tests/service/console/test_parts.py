@@ -20,7 +20,7 @@ from hal.camera_model import project
 from hal.panel import NumberGoal, Panel, load_panel
 from hal.panel.limits import Limits
 from manipulation import Kinematics
-from service.console.cell_scene import joint_frames
+from service.console.cell_scene import along_y, joint_frames
 from service.console.comparison import change_of, earlier
 from service.console.devices_page import shown_value
 from service.console.history_page import fits
@@ -173,7 +173,15 @@ def test_the_drawn_arm_is_the_arm_that_plans() -> None:
     told = jsonable(asdict(arm))
     q_rad = np.array([0.3, 0.8, -0.9, 0.4, 1.1, -0.2])
     flange = joint_frames(told["links"], q_rad.tolist())[-1]
-    assert np.allclose(flange.as_matrix(), Kinematics.of(arm).flange(q_rad).as_matrix(), atol=1e-9)
+    assert np.allclose(flange, Kinematics.of(arm).flange(q_rad).as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.6, -0.8, 0.0), (2 / 3, 1 / 3, -2 / 3)])
+def test_a_rod_is_turned_from_y_into_its_direction(direction: tuple[float, float, float]) -> None:
+    turn = np.array(along_y(np.array(direction)))
+    assert np.allclose(turn @ [0.0, 1.0, 0.0], direction, atol=1e-9)
+    assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    assert np.isclose(np.linalg.det(turn), 1.0)
 
 
 @pytest.mark.parametrize("projection", ["pinhole", "orthographic", "polar"])

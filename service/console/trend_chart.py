@@ -142,15 +142,17 @@ def _series(trend: Trend, colour: str, axis: int) -> Iterator[dict[str, Any]]:
     shared = {"type": "line", "yAxisIndex": axis, "itemStyle": {"color": colour}}
     unseen = {**shared, "stack": one.name, "stackStrategy": "all", "silent": True, "symbol": "none"}
     edge = {**unseen, "lineStyle": {"opacity": 0}, "tooltip": {"show": False}}
-    yield {**edge, "data": [[1e3 * point.at_s, point.low] for point in trend.points]}
-    band = [[1e3 * point.at_s, point.high - point.low] for point in trend.points]
+    # ECharts ends its zoom at whole milliseconds, and draws no point that lies a fraction beyond it.
+    whole_ms = [round(1e3 * point.at_s) for point in trend.points]
+    yield {**edge, "data": [[at_ms, point.low] for at_ms, point in zip(whole_ms, trend.points, strict=True)]}
+    band = [[at_ms, point.high - point.low] for at_ms, point in zip(whole_ms, trend.points, strict=True)]
     yield {**edge, "areaStyle": {"color": colour, "opacity": 0.22}, "data": band}
     yield {
         **shared,
         "name": label_of(one),
         "symbolSize": 9,
         "lineStyle": {"color": colour},
-        "data": [[1e3 * point.at_s, round(point.value, 6)] for point in trend.points],
+        "data": [[at_ms, round(point.value, 6)] for at_ms, point in zip(whole_ms, trend.points, strict=True)],
         "markLine": {"symbol": "none", "silent": True, "data": list(_limits(one, colour, is_left=axis % 2 == 1))},
     }
 

@@ -39,7 +39,7 @@
   }, 500);
 })();
 // Draws the cell in 3-D anew only where a message or the camera may have changed it; drawing it all the time takes half a processor.
-// A drawing that takes long, for example without a graphics card, is followed by a pause of the same length: messages come first.
+// A drawing that takes long, for example without a graphics card, is followed by a pause of about three times its length: messages come first.
 (() => {
   const AFTER_MESSAGE_MS = 300, AT_LEAST_EVERY_MS = 5000, FRAME_MS = 50;
   const thrifty = new WeakSet();

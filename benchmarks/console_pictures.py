@@ -99,6 +99,7 @@ def _pointed(page: Page, service: Served) -> None:
 
 
 def _uploaded(page: Page, _service: Served) -> None:
+    until(page, "document.querySelector('#known').textContent.includes('kinds')")
     page.set_input_files("#file", ROOT / "docs/images/teach-mushroom.png")
     until(page, "document.querySelector('#picture').naturalWidth > 0")
     size = page.locator("#picture").bounding_box()

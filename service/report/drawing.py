@@ -13,9 +13,10 @@ from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.panel import Panel
 from perception.vision import contour_m
-from service.report.plots import figure_png
+from service.report.plots import figure_png, show_image
 
 PLATE, OBJECT, LIGHT = "#2ec4b6", "#ff9f1c", "#ffe066"
+WIDTH_PX, DPI = 800, 100
 
 
 def panel_drawing(
@@ -24,9 +25,9 @@ def panel_drawing(
     """Return a PNG of the image with plate, objects, lights and the panel's axes projected by the pose."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 8.0 * intrinsics.height_px / intrinsics.width_px), dpi=100)
+    figure = Figure(figsize=(WIDTH_PX / DPI, WIDTH_PX / DPI * intrinsics.height_px / intrinsics.width_px), dpi=DPI)
     pane = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    pane.imshow(pixels, cmap="gray", vmin=0, vmax=255, alpha=0.8)
+    show_image(pane, pixels, WIDTH_PX, alpha=0.8)
 
     def line(points_m: Array, colour: str, width: float = 1.2) -> None:
         u, v = project(camera_from_panel.apply(points_m), intrinsics).T

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -18,7 +20,8 @@ if TYPE_CHECKING:
 
 Pixels = NDArray[np.uint8]
 INK, SOFT = "#1c2733", "#5a6b7b"
-MAX_PLOT_POINTS = 4000
+DRAWN_COLUMNS = 800  # of a curve; its pane is about as many pixels wide
+PATH_POINTS = 200
 CROP_MARGIN_PX = 8
 MOST_PX = 1100
 ON_PLATE_M = 0.005
@@ -66,7 +69,7 @@ def lights_picture(image_off: Pixels, image_on: Pixels, centres_px: NDArray[Any]
         ("lights off", "lights on", "on minus off"),
         strict=True,
     ):
-        pane.imshow(pixels, cmap="gray", vmin=0, vmax=255)
+        show_image(pane, pixels.astype(np.uint8), 350)
         pane.set_title(title, fontsize=9, color=INK)
         pane.set_axis_off()
     for (u, v), name in zip(centres_px, names, strict=True):
@@ -81,7 +84,7 @@ def points_picture(image: Pixels, points_px: NDArray[Any], names: Sequence[str])
     """Draw an image with the points that show where the panel is."""
     figure = sheet(4.6)
     pane = figure.subplots()
-    pane.imshow(image, cmap="gray", vmin=0, vmax=255)
+    show_image(pane, image, 640)
     pane.set_axis_off()
     for (u, v), name in zip(points_px, names, strict=True):
         pane.plot(u, v, "o", ms=5, mfc="none", mec="#ff9f1c")
@@ -172,8 +175,8 @@ def wrench_picture(motions: Sequence[MotionReport]) -> bytes:
     force, torque = figure.subplots(2, 1, sharex=True)
     times, wrench = _joined(motions, lambda m: m.log.wrench)
     for k, axis in enumerate("xyz"):
-        force.plot(times, wrench[:, k], lw=0.8, label=axis)
-        torque.plot(times, wrench[:, 3 + k], lw=0.8, label=axis)
+        force.plot(*thinned(times, wrench[:, k]), lw=0.8, label=axis)
+        torque.plot(*thinned(times, wrench[:, 3 + k]), lw=0.8, label=axis)
     for motion in motions:
         if motion.peak_force_n > 6.0:
             force.annotate(motion.name, (motion.started_s, motion.peak_force_n), fontsize=6, color=SOFT, rotation=30)
@@ -190,10 +193,10 @@ def joints_picture(motions: Sequence[MotionReport]) -> bytes:
     pane = figure.subplots()
     times, joints = _joined(motions, lambda m: m.log.positions_rad)
     for k in range(joints.shape[1]):
-        pane.plot(times, joints[:, k], lw=0.9, label=f"joint {k + 1}")
+        pane.plot(*thinned(times, joints[:, k]), lw=0.9, label=f"joint {k + 1}")
     pane.set_ylabel("rad")
     pane.set_xlabel("cell time, s")
-    pane.legend(ncols=6, fontsize=7, frameon=False)
+    pane.legend(ncols=7, fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return _finished(figure, (pane,))
 
 
@@ -201,10 +204,29 @@ def _joined(motions: Sequence[MotionReport], pick: Any) -> tuple[NDArray[Any], N
     pieces = [(m.started_s + m.log.times_s, pick(m)) for m in motions if len(m.log.times_s)]
     if not pieces:
         return np.zeros(1), np.zeros((1, 6))
-    times = np.concatenate([t for t, _ in pieces])
-    values = np.concatenate([v for _, v in pieces])
-    keep = slice(None, None, max(1, len(times) // MAX_PLOT_POINTS))
-    return times[keep], values[keep]
+    return np.concatenate([t for t, _ in pieces]), np.concatenate([v for _, v in pieces])
+
+
+def thinned(times: NDArray[Any], values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the lowest and highest sample of each of 800 stretches of a curve (N,), in order, so that no peak is lost."""
+    if len(times) <= 2 * DRAWN_COLUMNS:
+        return times, values
+    edges = np.linspace(0, len(times), DRAWN_COLUMNS + 1).astype(int)
+    kept = sorted({i + int(pick(values[i:j])) for i, j in pairwise(edges) for pick in (np.argmin, np.argmax)})
+    return times[kept], values[kept]
+
+
+def show_image(pane: Any, pixels: Pixels, most_px: int, alpha: float = 1.0) -> None:
+    """Show a gray (H, W) or colour (H, W, 3) image in a pane, made smaller first where it is wider than `most_px`.
+
+    OpenCV makes it smaller while other threads of this process run; matplotlib lets them wait, 40 ms for a camera's image.
+    """
+    height, width = pixels.shape[:2]
+    extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+    if width > most_px:
+        size = (most_px, round(height * most_px / width))
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    pane.imshow(pixels, cmap="gray", vmin=0, vmax=255, extent=extent, alpha=alpha)
 
 
 def sheet(height_in: float) -> Figure:
@@ -222,9 +244,14 @@ def _finished(figure: Figure, panes: Sequence[Any]) -> bytes:
 
 
 def figure_png(figure: Figure) -> bytes:
-    """Return a finished figure as PNG bytes."""
+    """Return a finished figure as PNG bytes.
+
+    Long curves are drawn in pieces, because the event loop waits while one is drawn, 50 ms for 7500 points.
+    """
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     stream = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib has no annotation here
+    with rc_context({"agg.path.chunksize": PATH_POINTS}):
+        FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib has no annotation here
     return stream.getvalue()

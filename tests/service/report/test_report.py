@@ -19,7 +19,7 @@ from service.commands.report import folder_of
 from service.report.blocks import Appendix, Block, Facts, Figures, Table, Text, Title
 from service.report.document import Report, blocks_of
 from service.report.pdf import pdf_of
-from service.report.plots import box_of, png_of
+from service.report.plots import box_of, png_of, thinned
 from service.report.upright import quarter_turns, turned_image, turned_points
 from service.report.write import render
 
@@ -179,6 +179,17 @@ def test_a_range_picture_is_cut_to_what_it_shows() -> None:
     plate[119, 0] = True
     assert box_of(plate) == (slice(26, 63), slice(34, 105))
     assert box_of(np.zeros((120, 160), bool)) == (slice(None), slice(None))
+
+
+def test_a_long_curve_is_drawn_with_all_its_peaks() -> None:
+    times = np.linspace(0.0, 60.0, 15_000)
+    force_n = np.sin(times)
+    force_n[[7, 9_000, 14_999]] = 50.0, -40.0, 30.0
+    shown_s, shown_n = thinned(times, force_n)
+    assert len(shown_s) <= 1600
+    assert (np.diff(shown_s) > 0).all()
+    assert {50.0, -40.0, 30.0} <= set(shown_n)
+    assert thinned(times[:9], force_n[:9])[1].tolist() == force_n[:9].tolist()
 
 
 def test_the_report_has_an_appendix_with_all_pictures() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -22,7 +23,7 @@ from hal.motion import (
 )
 from manipulation.planning.cartesian_path import line, shifted, through
 from manipulation.planning.hand import CLOSED_M
-from manipulation.skills.context import SkillContext
+from manipulation.skills.context import SkillContext, leaning
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 
 APPROACH_M_PER_S = 0.06
@@ -190,17 +191,30 @@ class Attempt:
         may_touch: Sequence[str],
         width_m: float,
         name: str,
+        may_lean: bool = False,
     ) -> int:
         """Choose the best of several strokes, set the opening, go to its standoff and tare there; returns its index.
 
         Args:
             options: for each stroke its panel_from_grip poses, the first at the standoff.
+            may_lean: whether the hand may lean where the arm cannot follow any of them, because the stroke goes on from wherever
+                the fingertips are.
 
         Raises:
             Unsupported: the hand must open for it and cannot; nothing has moved.
         """
         self.context.hand.check_opens(width_m)
-        index, path = self.context.choose(options, near_rad=self.joints(), width_m=width_m, may_touch=may_touch)
+        choose = partial(self.context.choose, near_rad=self.joints(), width_m=width_m, may_touch=may_touch)
+        try:
+            index, path = choose(options)
+        except Unreachable as straight:
+            if not may_lean:
+                raise
+            try:
+                index, path = choose(leaning(options))
+            except Unreachable:
+                raise straight from None
+            index %= len(options)
         self.go_to_opening(path[0], width_m=width_m, name=f"to {name}")
         self.context.mover.tare()
         return index

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.errors import Unreachable
@@ -24,6 +24,7 @@ STROKE_MARGIN_M = 0.001
 WAY_BACK_M = 0.05
 NO_WAY_BACK_S = 3.0  # a stroke from which the hand cannot go straight back counts as so much longer
 REACH_TURNS_RAD = np.linspace(-np.pi, np.pi, 12, endpoint=False)
+LEANS_RAD = tuple(float(angle) for angle in np.radians([10.0, -10.0, 20.0, -20.0]))
 FINGERS = ("finger_left", "finger_right")
 
 
@@ -167,6 +168,21 @@ def panel_from_grip(point_m: Sequence[float], turn_rad: float) -> RigidTransform
     """
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     return transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], point_m)
+
+
+def leaning(strokes: Sequence[Sequence[RigidTransform]]) -> list[list[RigidTransform]]:
+    """Return strokes (panel_from_grip poses) with a hand that leans, for an arm that does not reach them straight.
+
+    The fingertips stay where they are. The hand leans by 10 and 20 degrees about the panel's x axis and about its y axis, and
+    the standoff, which comes first, is as far back along the fingers as before.
+    """
+    leaned = []
+    for rotation in (Rotation.from_rotvec(lean * axis) for lean in LEANS_RAD for axis in np.eye(3)[:2]):
+        for standoff, *poses in strokes:
+            tips = [RigidTransform.from_components(pose.translation, rotation * pose.rotation) for pose in poses]
+            back_m = float(np.linalg.norm(standoff.translation - poses[0].translation))
+            leaned.append([tips[0] * RigidTransform.from_translation([0.0, 0.0, -back_m]), *tips])
+    return leaned
 
 
 def is_in_reach(

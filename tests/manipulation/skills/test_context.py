@@ -13,7 +13,7 @@ from hal.panel import Shown
 from manipulation.arm.kinematics import Kinematics
 from manipulation.planning.hand import Hand
 from manipulation.planning.time_parameterization import SpeedLimits
-from manipulation.skills.context import SkillContext, panel_from_grip
+from manipulation.skills.context import SkillContext, leaning, panel_from_grip
 from manipulation.skills.sweep import Sweep, plan_sweep
 from tests.manipulation.arms import T3
 from tests.manipulation.planning.test_collision import make_panel
@@ -85,6 +85,19 @@ def test_a_panel_out_of_reach_is_unreachable() -> None:
     ways = [[panel_from_grip((0.0, 0.0, 0.05), 0.0)]]
     with pytest.raises(Unreachable):
         work.choose(ways, near_rad=PARK, width_m=0.0, may_touch=())
+
+
+def test_a_leaning_hand_keeps_its_tips_and_comes_along_its_fingers() -> None:
+    stroke = [panel_from_grip((0.1, y, z), 0.4) for y, z in ((0.02, 0.06), (0.02, 0.02), (0.05, 0.02))]
+    strokes = leaning([stroke])
+    leans_deg = [float(np.degrees(np.arccos(-one[1].rotation.as_matrix()[2, 2]))) for one in strokes]
+    assert np.allclose(sorted(leans_deg), [10.0] * 4 + [20.0] * 4)
+    for one in strokes:
+        assert np.allclose([pose.translation for pose in one[1:]], [pose.translation for pose in stroke[1:]])
+        assert np.allclose(
+            (one[0].inv() * one[1]).as_matrix(), RigidTransform.from_translation([0, 0, 0.04]).as_matrix()
+        )
+        assert np.allclose((one[1].inv() * one[2]).rotation.as_matrix(), np.eye(3))
 
 
 def test_a_wider_hand_has_its_fingers_further_apart_and_the_same_body() -> None:

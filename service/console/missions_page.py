@@ -13,7 +13,7 @@ from service.access.keys import Role
 from service.client import FINAL
 from service.console.mirror import Mirror
 from service.console.mission_words import did, is_plan, lasting, step_list
-from service.console.page_frame import Place, attempt, button, clock, live, page_frame, picks, table
+from service.console.page_frame import PATHS, Place, attempt, button, clock, live, page_frame, picks, table
 from service.console.texts import say, word
 from service.console.values import attribute
 
@@ -188,6 +188,7 @@ def plan_table(mission: str, plan: dict[str, Any], panel: Panel | None) -> str:
         lines.append(f"<p>{attribute(told)}</p>")
     else:
         lines.append(f'<p class="bad">{say("plan.impossible")}</p>')
+    lines.append(f'<p><a href="{PATHS["cell"]}">{attribute(say("plan.in_3d"))}</a></p>')
     if not plan["located"]:
         lines.append(f'<p class="quiet">{say("plan.not_located")}</p>')
     rows = []

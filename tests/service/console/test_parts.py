@@ -267,6 +267,7 @@ def test_an_unreachable_station_is_told_in_the_plan(panel: Panel) -> None:
     plan = {"stations": stations, "is_possible": False, "located": False, "ways_s": 0, "contact_s": 0, "expected_s": 0}
     told = plan_table("demo", plan, panel)
     assert "the mission would fail there" in told
+    assert '<a href="/cell">See this way in 3-D</a>' in told
     assert '<td class="bad">the floor is in the way</td>' in told
 
 

@@ -10,7 +10,7 @@ from nicegui import ui
 from service.access.keys import Role
 from service.console.mirror import Mirror
 from service.console.mission_words import name_of
-from service.console.page_frame import Place, attempt, button, clock, live, page_frame, picks, table
+from service.console.page_frame import Place, attempt, button, clock, live, open_dialog, page_frame, picks, table
 from service.console.texts import say, word
 from service.console.values import attribute
 
@@ -103,11 +103,11 @@ class _Desk:
         if deed not in ASKS_WHY:
             await self._send(deed, alarm, {})
             return
+        question = say(f"alarms.ask.{deed}", label=name_of(self._mirror.panel, alarm.partition(".")[0]))
         self._told.set_content("")
         self._asked.clear()
         with self._asked:
-            label = name_of(self._mirror.panel, alarm.partition(".")[0])
-            ui.html(attribute(say(f"alarms.ask.{deed}", label=label)), sanitize=False, tag="p")
+            ui.html(attribute(question), sanitize=False, tag="p")
             hours = _hours() if deed == "shelve" else None
             reason = ui.input(label=say("alarms.reason")).props("outlined maxlength=500")
 
@@ -123,7 +123,7 @@ class _Desk:
             with ui.element("div").classes("row").style("margin-top:.6rem"):
                 button(say(f"alarms.confirm.{deed}"), go)
                 button(say("object.no"), self._dialog.close, look="plain")
-        self._dialog.open()
+        open_dialog(self._dialog, question)
 
     async def _send(self, deed: str, alarm: str, body: dict[str, Any]) -> None:
         who = str(self._you.value or "").strip()

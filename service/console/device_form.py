@@ -9,7 +9,7 @@ from nicegui import ui
 from hal.errors import CellError
 from hal.toml_text import toml_text
 from service.console.mirror import Mirror
-from service.console.page_frame import attempt, button
+from service.console.page_frame import attempt, button, open_dialog
 from service.console.texts import say
 from service.console.values import attribute
 
@@ -34,10 +34,11 @@ class DeviceDialog:
             return
         options = {key: value for key, value in found["options"].items() if value != SECRET}
         hidden = sorted(set(found["options"]) - set(options))
+        heading = say("device.swap.heading", name=name)
         self._told.set_content("")
         self._form.clear()
         with self._form:
-            ui.html(attribute(say("device.swap.heading", name=name)), sanitize=False, tag="h2")
+            ui.html(attribute(heading), sanitize=False, tag="h2")
             says = [say("device.swap.says"), *([say("device.swap.secret", keys=", ".join(hidden))] if hidden else [])]
             ui.html(attribute(" ".join(says)), sanitize=False, tag="p").classes("quiet")
             driver = ui.input(label=say("device.swap.driver"), value=found["driver"]).props("outlined dense")
@@ -64,4 +65,4 @@ class DeviceDialog:
             with ui.element("div").classes("row").style("margin-top:.6rem"):
                 button(say("device.swap.do"), swap)
                 button(say("object.no"), self._dialog.close, look="plain")
-        self._dialog.open()
+        open_dialog(self._dialog, heading)

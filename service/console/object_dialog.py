@@ -15,7 +15,7 @@ from service.console.limits_form import LimitsForm
 from service.console.mirror import Mirror
 from service.console.mission_words import did
 from service.console.object_facts import facts_html, history_html
-from service.console.page_frame import attempt, button
+from service.console.page_frame import attempt, button, open_dialog
 from service.console.service_form import ServiceForm
 from service.console.teach_page import PATH as TEACH
 from service.console.texts import say, word
@@ -63,7 +63,7 @@ class ObjectDialog:
         self._renew(even_if_closed=True)
         self._offer()
         self._limits.show(one)
-        self._dialog.open()
+        open_dialog(self._dialog, label_of(one))
         await self._service.show(one)
         await self._load_history()
 

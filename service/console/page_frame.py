@@ -117,6 +117,12 @@ def button(label: str, on_click: Callable[[], Any], *, look: str = "do") -> Any:
     )
 
 
+def open_dialog(dialog: Any, name: str) -> None:
+    """Open a dialog under the name that screen readers tell."""
+    dialog.props["aria-label"] = name
+    dialog.open()
+
+
 def picks(element: Any, on_pick: Callable[[str], Any], *, what: str = "object") -> Any:
     """Call `on_pick` with the name that a clicked part of the element carries in its `data-` attribute."""
     for kind in ("click", "keydown"):

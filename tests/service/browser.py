@@ -33,6 +33,12 @@ CONSOLE_PAGES = (
     "/mission-editor",
     "/teach",
 )
+OWN_PAGES = {
+    "/": "#devices li",
+    "/docs": "details",
+    "/teach.html": "#known",
+    "/login.html": "#key",
+}  # with a part of each
 PATIENCE_MS = 150_000  # the first click may compile kernels, and the machine may be busy
 NEEDS_CHROMIUM = [
     pytest.mark.slow,
@@ -48,6 +54,18 @@ def browser() -> Iterator[Any]:
         browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
         yield browser
         browser.close()
+
+
+def barriers(tab: Any) -> list[str]:
+    """Return what axe finds on a page that keeps somebody from using it, each with its first element.
+
+    It waits until nothing fades in any more, because half faded text has little contrast.
+    """
+    from axe_playwright_python.sync_playwright import Axe
+
+    until(tab, "document.getAnimations().length === 0")
+    faults = Axe().run(tab).response["violations"]
+    return [f"{fault['id']}: {fault['nodes'][0]['html'][:120]}" for fault in faults]
 
 
 def new_tab(browser: Any, *, height_px: int) -> tuple[Any, list[str]]:

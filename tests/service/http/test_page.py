@@ -14,7 +14,7 @@ from hal.simulated import Fault
 from service.client import Client
 from service.operations import Operation
 from service.serve import Options, Panelwright
-from tests.service.browser import NEEDS_CHROMIUM, browser, new_tab, until
+from tests.service.browser import NEEDS_CHROMIUM, OWN_PAGES, barriers, browser, new_tab, until
 from tests.service.conftest import WriteCell
 from tests.service.verbs import OPERATIONS, HoldRequest, HoldResult, hold
 from tests.service.waiting import eventually
@@ -71,6 +71,21 @@ def test_the_tasks_can_be_read_on_a_telephone(page: Any, served_page: Panelwrigh
     assert telephone.evaluate("() => document.querySelector('#tasks td.step').clientWidth") > 100
     assert telephone.evaluate("() => document.documentElement.scrollWidth") <= 400
     telephone.close()
+
+
+@pytest.mark.parametrize(("width_px", "scheme"), [(1440, "light"), (390, "dark")])
+def test_no_page_of_the_service_has_a_barrier(
+    browser: Any, served_page: Panelwright, width_px: int, scheme: str
+) -> None:
+    context = browser.new_context(viewport={"width": width_px, "height": 844}, color_scheme=scheme, bypass_csp=True)
+    tab = context.new_page()
+    found: list[str] = []
+    for path, sign in OWN_PAGES.items():
+        tab.goto(served_page.url + path)
+        until(tab, f"document.querySelectorAll('{sign}').length")
+        found += [f"{path} {fault}" for fault in barriers(tab)]
+    context.close()
+    assert found == []
 
 
 def test_the_arm_shows_live(page: Any) -> None:

@@ -22,6 +22,9 @@ from service.report.pdf import pdf_of
 from service.report.plots import box_of, png_of, thinned
 from service.report.upright import quarter_turns, turned_image, turned_points
 from service.report.write import render
+from tests.service.browser import CHROMIUM, barriers, browser
+
+__all__ = ["browser"]  # a fixture
 
 ALARM = {
     "object": "pressure", "kind": "high", "says": "4.1 bar is above 4 bar", "priority": "high", "what_to_do": "Call Ann."
@@ -190,6 +193,18 @@ def test_a_long_curve_is_drawn_with_all_its_peaks() -> None:
     assert (np.diff(shown_s) > 0).all()
     assert {50.0, -40.0, 30.0} <= set(shown_n)
     assert thinned(times[:9], force_n[:9])[1].tolist() == force_n[:9].tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium: apt-get install chromium")
+def test_a_report_has_no_barrier(browser: Any, tmp_path: Path) -> None:
+    page = render(folder_with(tmp_path / "run", summary(alarms=[ALARM])))
+    for width_px in (1440, 390):
+        tab = browser.new_page(viewport={"width": width_px, "height": 844})
+        tab.goto(page.as_uri())
+        assert barriers(tab) == []
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width_px
+        tab.close()
 
 
 def test_the_report_has_an_appendix_with_all_pictures() -> None:

@@ -181,7 +181,8 @@ class _Desk:
 
 def plan_table(mission: str, plan: dict[str, Any], panel: Panel | None) -> str:
     """Return the stations of a plan with their times, and whether it can be done."""
-    lines = [f"<h3>{attribute(say('plan.heading', mission=mission))}</h3>"]
+    heading = say("plan.heading", mission=mission)
+    lines = [f"<h3>{attribute(heading)}</h3>"]
     if plan["is_possible"]:
         times = {"minutes": plan["expected_s"], "ways": plan["ways_s"], "contact": plan["contact_s"]}
         told = say("plan.possible", **{key: lasting(value) for key, value in times.items()})
@@ -199,9 +200,7 @@ def plan_table(mission: str, plan: dict[str, Any], panel: Panel | None) -> str:
         rows.append(
             f"<tr><td>{number}</td><td>{where}</td><td>{attribute(one['step'])}</td><td{look}>{attribute(way)}</td></tr>"
         )
-    return "".join(lines) + table(
-        ["number", "station", "step_name", "way"], rows, name=say("plan.heading", mission=mission)
-    )
+    return "".join(lines) + table(["number", "station", "step_name", "way"], rows, name=heading)
 
 
 def _station(what: str, panel: Panel | None) -> str:

@@ -61,7 +61,7 @@ def barriers(tab: Any) -> list[str]:
 
     It waits until nothing fades in any more, because half faded text has little contrast.
     """
-    from axe_playwright_python.sync_playwright import Axe
+    from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]  # it has no annotations
 
     until(tab, "document.getAnimations().length === 0")
     faults = Axe().run(tab).response["violations"]

@@ -26,6 +26,7 @@ BY_CONTACT = (Quantity.FORCE, Quantity.TORQUE, Quantity.FORCE_RISE)
 SLOWING_M_PER_S2 = 2.0  # a lower limit of the tip's speed takes effect at this rate, so that the arm can follow it
 BEHIND_M, BEHIND_TICKS = 0.002, 3  # a set-point that is so far behind the wanted one lets the motion's time stand still
 ON_ITS_WAY_RAD = 1e-6
+WAITS_S, NEARER_M = 1.0, 1e-4  # a motion waits so long for a set-point that does not come nearer by so much
 LOOK_BACK_TICKS = 3  # with one, a jitter of 10 % in the ticks triples the following error of a steady motion
 
 
@@ -51,6 +52,10 @@ class SetPointLimiter:
         self._full_m_per_s = self._tip_limit = tip_limit_m_per_s
         self._workspace = Workspace(workspace, kinematics, flange_from_tool, dt_s)
         self._dt_s = dt_s
+        self._nearest_m, self._waited_s = (
+            np.inf,
+            0.0,
+        )  # to the wanted one while the time stands still; since it was reached
         self._wanted_rad = np.zeros((LOOK_BACK_TICKS, len(kinematics.dh)))  # newest first
         self.last_rad = np.zeros(len(kinematics.dh))
         self.velocity_rad_per_s = np.zeros(len(kinematics.dh))
@@ -85,13 +90,21 @@ class SetPointLimiter:
         Otherwise the set-points of the motion would run ahead and the arm would cut its corners. That happens below the
         speed for which the motion is planned, and at that speed too: where a way just keeps the limit of the tip, the
         smallest excess slows each joint by its own share, and the arm left a planned way by 0.3 rad. A set-point that stands
-        still is not waited for, because nothing would end its motion.
+        still, or comes no nearer for a second, is not waited for, because nothing would end its motion.
         """
         if self.is_at_rest or np.abs(wanted_rad - out_rad).max() < ON_ITS_WAY_RAD:
+            self._nearest_m, self._waited_s = np.inf, 0.0
             return 0.0
         behind = self._workspace.tip_m(wanted_rad) - self._workspace.tip_m(out_rad)
         most_m = max(BEHIND_M, BEHIND_TICKS * self._full_m_per_s * self._dt_s)
-        return min(1.0, float(np.linalg.norm(behind)) / most_m)
+        behind_m = float(np.linalg.norm(behind))
+        if behind_m < most_m:
+            self._nearest_m, self._waited_s = np.inf, 0.0
+            return behind_m / most_m
+        if behind_m < self._nearest_m - NEARER_M:
+            self._nearest_m, self._waited_s = behind_m, 0.0
+        self._waited_s += self._dt_s
+        return 1.0 if self._waited_s <= WAITS_S else 0.0
 
     def _step(self, wanted_rad: Array) -> Array:
         kin = self._kinematics

@@ -208,6 +208,18 @@ def test_behind_a_leap_the_arm_brakes_in_time_and_rests_where_it_was_wanted(
         assert (np.abs(accelerations) <= ACCELERATION * (1.0 + 1e-6)).all()
 
 
+def test_a_motion_does_not_wait_for_ever_for_a_set_point_that_comes_no_nearer() -> None:
+    made = made_filter()
+    made.begin_at(HOME)
+    made.sent(HOME + 1e-3)  # not at rest
+    ahead, near = made.last_rad + 0.3, made.last_rad + 1e-4
+    waited = [made.waiting_share(ahead, made.last_rad) for _ in range(round(2.0 / DT_S))]
+    assert waited[: round(0.9 / DT_S)] == [1.0] * round(0.9 / DT_S)
+    assert waited[round(1.1 / DT_S) :] == [0.0] * (len(waited) - round(1.1 / DT_S))
+    assert 0.0 < made.waiting_share(near, made.last_rad) < 1.0
+    assert made.waiting_share(ahead, made.last_rad) == 1.0, "after progress it waits again"
+
+
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), held=st.integers(1, 200))
 def test_whatever_leaps_the_arm_keeps_its_range_and_never_brakes_harder_than_it_may(seed: int, held: int) -> None:

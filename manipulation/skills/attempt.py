@@ -23,7 +23,7 @@ from hal.motion import (
 )
 from manipulation.planning.cartesian_path import line, shifted, through
 from manipulation.planning.hand import CLOSED_M
-from manipulation.skills.context import SkillContext, leaning
+from manipulation.skills.context import Blocked, SkillContext, leaning
 from manipulation.skills.outcome import ObjectState, Outcome, SkillFailure
 
 APPROACH_M_PER_S = 0.06
@@ -191,14 +191,13 @@ class Attempt:
         may_touch: Sequence[str],
         width_m: float,
         name: str,
-        may_lean: bool = False,
+        leans_about: Sequence[int] = (),
     ) -> int:
         """Choose the best of several strokes, set the opening, go to its standoff and tare there; returns its index.
 
         Args:
             options: for each stroke its panel_from_grip poses, the first at the standoff.
-            may_lean: whether the hand may lean where the arm cannot follow any of them, because the stroke goes on from wherever
-                the fingertips are.
+            leans_about: its own axes about which the hand may lean where the arm cannot follow any of them.
 
         Raises:
             Unsupported: the hand must open for it and cannot; nothing has moved.
@@ -208,10 +207,10 @@ class Attempt:
         try:
             index, path = choose(options)
         except Unreachable as straight:
-            if not may_lean:
+            if not leans_about or isinstance(straight, Blocked):
                 raise
             try:
-                index, path = choose(leaning(options))
+                index, path = choose(leaning(options, leans_about), must_go_back=True)
             except Unreachable:
                 raise straight from None
             index %= len(options)

@@ -20,12 +20,22 @@ from manipulation.planning.shapes import CollisionBox, floor_box, panel_boxes
 from manipulation.planning.time_parameterization import SpeedLimits
 from manipulation.planning.transfer import THOROUGH, Effort, TransferPlanner
 
+MOVE_IT = "move the panel nearer to the middle of the arm's workspace"
 STROKE_MARGIN_M = 0.001
 WAY_BACK_M = 0.05
 NO_WAY_BACK_S = 3.0  # a stroke from which the hand cannot go straight back counts as so much longer
 REACH_TURNS_RAD = np.linspace(-np.pi, np.pi, 12, endpoint=False)
 LEANS_RAD = tuple(float(angle) for angle in np.radians([10.0, -10.0, 20.0, -20.0]))
 FINGERS = ("finger_left", "finger_right")
+
+
+class Blocked(Unreachable):
+    """The arm can follow a stroke, but the hand would touch something else on its way; told as any place out of reach."""
+
+    @property
+    def type_name(self) -> str:
+        """Return the name of the error of which this is a case."""
+        return "unreachable"
 
 
 def _always() -> bool:
@@ -113,7 +123,13 @@ class SkillContext:
         return planner.plan(start_rad, goal_rad, name=name, effort=effort)
 
     def choose(
-        self, options: Sequence[Sequence[RigidTransform]], *, near_rad: Array, width_m: float, may_touch: Sequence[str]
+        self,
+        options: Sequence[Sequence[RigidTransform]],
+        *,
+        near_rad: Array,
+        width_m: float,
+        may_touch: Sequence[str],
+        must_go_back: bool = False,
     ) -> tuple[int, Array]:
         """Return which of several strokes the arm does best, and its joints (N, n) along it.
 
@@ -122,12 +138,13 @@ class SkillContext:
 
         Args:
             options: for each stroke its panel_from_grip poses, the first at the standoff.
+            must_go_back: whether a stroke from whose end the hand cannot go back along its fingers is none.
 
         Raises:
             Unreachable: none can be followed on one branch of the arm without touching anything else.
         """
         model = self.collision(width_m=width_m, may_touch=may_touch, near_plate=True)
-        failures, best = [], None
+        failures, best = list[Unreachable](), None
         for index, poses in enumerate(options):
             flange = [self.panel_pose * pose * self.flange_from_grip.inv() for pose in poses]
             try:
@@ -139,16 +156,19 @@ class SkillContext:
                 touching = next((q for q in path if not model.is_clear(q, margin_m=STROKE_MARGIN_M)), None)
                 if touching is not None:
                     what = f"the stroke would bring {model.nearest(touching)} together"
-                    failures.append(Unreachable(what, hint="another turn of the tool or a smaller opening may do"))
+                    failures.append(Blocked(what, hint="another turn of the tool or a smaller opening may do"))
                     continue
                 goes_back = self._goes_back(model, flange[-1], path[-1])
+                if must_go_back and not goes_back:
+                    failures.append(Unreachable("the hand could not go back along its fingers", hint=MOVE_IT))
+                    continue
                 cost = self.kinematics.effort_s(path, near_rad) + (0.0 if goes_back else NO_WAY_BACK_S)
                 if best is None or cost < best[0]:
                     best = (cost, index, path)
                 if goes_back:
                     break
         if best is None:
-            raise failures[-1]
+            raise next((one for one in failures if isinstance(one, Blocked)), failures[-1])
         return best[1], best[2]
 
     def _goes_back(self, model: CollisionModel, base_from_flange: RigidTransform, q_rad: Array) -> bool:
@@ -170,16 +190,16 @@ def panel_from_grip(point_m: Sequence[float], turn_rad: float) -> RigidTransform
     return transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], point_m)
 
 
-def leaning(strokes: Sequence[Sequence[RigidTransform]]) -> list[list[RigidTransform]]:
+def leaning(strokes: Sequence[Sequence[RigidTransform]], axes: Sequence[int]) -> list[list[RigidTransform]]:
     """Return strokes (panel_from_grip poses) with a hand that leans, for an arm that does not reach them straight.
 
-    The fingertips stay where they are. The hand leans by 10 and 20 degrees about the panel's x axis and about its y axis, and
-    the standoff, which comes first, is as far back along the fingers as before.
+    The fingertips stay where they are. The hand leans by 10 and 20 degrees about its own `axes` (0: the closing direction, 1: the
+    width of the fingers), and the standoff, which comes first, is as far back along the fingers as before.
     """
     leaned = []
-    for rotation in (Rotation.from_rotvec(lean * axis) for lean in LEANS_RAD for axis in np.eye(3)[:2]):
+    for lean in (Rotation.from_rotvec(angle * np.eye(3)[axis]) for angle in LEANS_RAD for axis in axes):
         for standoff, *poses in strokes:
-            tips = [RigidTransform.from_components(pose.translation, rotation * pose.rotation) for pose in poses]
+            tips = [pose * RigidTransform.from_rotation(lean) for pose in poses]
             back_m = float(np.linalg.norm(standoff.translation - poses[0].translation))
             leaned.append([tips[0] * RigidTransform.from_translation([0.0, 0.0, -back_m]), *tips])
     return leaned

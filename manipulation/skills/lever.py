@@ -137,7 +137,7 @@ def _turn_lever(attempt: Attempt, valve: Lever, turn: _Turn) -> float:
     """Make one stroke; returns the angle that the bar reached, as measured by the tool."""
     side_m = valve.width_m / 2 + attempt.context.hand.closed_half_m[1]  # between the middles of bar and hand in contact
     ways = [_way(valve, turn, side_m + BESIDE_M, flip) for flip in (0.0, np.pi)]
-    attempt.begin(ways, may_touch=(valve.name,), width_m=0.0, name=valve.name)
+    attempt.begin(ways, may_touch=(valve.name,), width_m=0.0, name=valve.name, leans_about=(0, 1))
     down = attempt.advance(STANDOFF_M + OVERLAP_M, name="approach")
     if down.tripped is not None:
         raise SkillFailure(Outcome.MISSED, "the hand landed on the bar")

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
-from hal.errors import NoRoom, Unreachable
+from hal.errors import NoRoom
 from hal.geometry import certain, identity, matrix_of
 from hal.motion import DeclaredMotion, MotionReport, RobotState
 from hal.panel import NumberGoal, Panel, PanelObject, Shown
@@ -22,7 +22,7 @@ from manipulation.planning.clearance import segment_box
 from manipulation.planning.hand import Hand
 from manipulation.planning.shapes import Capsule, CollisionBox, envelope, panel_boxes
 from manipulation.planning.time_parameterization import SpeedLimits
-from manipulation.skills.context import FINGERS, STROKE_MARGIN_M, SkillContext
+from manipulation.skills.context import FINGERS, STROKE_MARGIN_M, Blocked, SkillContext
 from manipulation.skills.operate import operate
 from manipulation.skills.outcome import ObjectState
 
@@ -83,11 +83,12 @@ class _Rehearsal(SkillContext):
         near_rad: Array,  # noqa: ARG002 - of the arm, which is left out here
         width_m: float,
         may_touch: Sequence[str],
+        must_go_back: bool = False,  # noqa: ARG002 - of the arm, too
     ) -> tuple[int, Array]:
         """End the rehearsal if one of the strokes has room for the hand.
 
         Raises:
-            Unreachable: none has.
+            Blocked: none has.
         """
         capsules = self.hand.capsules(self.flange_from_grip, width_m)
         obstacles = [_Obstacle.of([panel_boxes(self.panel)[0]])]
@@ -101,7 +102,7 @@ class _Rehearsal(SkillContext):
             if least.free_m >= STROKE_MARGIN_M:
                 raise _Fits
             self.tried.append(least)
-        raise Unreachable("there is no room for the hand", hint="see what is in its way")
+        raise Blocked("there is no room for the hand", hint="see what is in its way")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

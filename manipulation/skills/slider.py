@@ -192,7 +192,7 @@ def _push(attempt: Attempt, fader: Slider, push: _Push) -> float:
     half_x, half_y = context.hand.closed_half_m
     turns = ((0.0, half_x), (np.pi, half_x), (np.pi / 2, half_y), (-np.pi / 2, half_y))
     ways = [_way(fader, push, turn, half) for turn, half in turns]
-    attempt.begin(ways, may_touch=(fader.name,), width_m=0.0, name=fader.name, may_lean=True)
+    attempt.begin(ways, may_touch=(fader.name,), width_m=0.0, name=fader.name, leans_about=(0, 1))
     top = fader.cap_size_m[2]
     down = attempt.advance(STANDOFF_M + top - TIP_HEIGHT_M, name="approach")
     if down.tripped is not None:

@@ -166,7 +166,7 @@ def _come_down(attempt: Attempt, switch: Handle, start_m: float, end_m: float, r
         [panel_from_grip(point, turn) for point in ((x, start_m, above), (x, start_m, reach_m), (x, end_m, reach_m))]
         for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)
     ]
-    attempt.begin(ways, may_touch=(switch.name,), width_m=0.0, name=switch.name, may_lean=True)
+    attempt.begin(ways, may_touch=(switch.name,), width_m=0.0, name=switch.name, leans_about=(0, 1))
     down = attempt.advance(switch.bat_length_m + STANDOFF_M, name="approach")
     if down.tripped is None:
         return

@@ -89,7 +89,7 @@ def test_a_panel_out_of_reach_is_unreachable() -> None:
 
 def test_a_leaning_hand_keeps_its_tips_and_comes_along_its_fingers() -> None:
     stroke = [panel_from_grip((0.1, y, z), 0.4) for y, z in ((0.02, 0.06), (0.02, 0.02), (0.05, 0.02))]
-    strokes = leaning([stroke])
+    strokes = leaning([stroke], (0, 1))
     leans_deg = [float(np.degrees(np.arccos(-one[1].rotation.as_matrix()[2, 2]))) for one in strokes]
     assert np.allclose(sorted(leans_deg), [10.0] * 4 + [20.0] * 4)
     for one in strokes:

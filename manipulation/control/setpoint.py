@@ -52,10 +52,8 @@ class SetPointLimiter:
         self._full_m_per_s = self._tip_limit = tip_limit_m_per_s
         self._workspace = Workspace(workspace, kinematics, flange_from_tool, dt_s)
         self._dt_s = dt_s
-        self._nearest_m, self._waited_s = (
-            np.inf,
-            0.0,
-        )  # to the wanted one while the time stands still; since it was reached
+        # While the time of a motion stands still: how near the set-point came to the wanted one, and how long ago.
+        self._nearest_m, self._waited_s = np.inf, 0.0
         self._wanted_rad = np.zeros((LOOK_BACK_TICKS, len(kinematics.dh)))  # newest first
         self.last_rad = np.zeros(len(kinematics.dh))
         self.velocity_rad_per_s = np.zeros(len(kinematics.dh))

@@ -58,6 +58,7 @@ DRAW_NOTHING = "getElement(Number(document.querySelector('.scene').id.slice(1)))
 DRAWN_DIGITS, LEAST_SAMPLES = 3, 30  # the drawing is rounded to a millimetre
 SAME_PLACE_M = 0.0015
 MISSIONS_IN_3D = 4
+CONNECTED = "document.querySelector('.top .quiet').textContent.includes('panel')"
 USABLE = (
     "document.querySelector('#stop-box')?.dataset.latched === 'no' && document.querySelector('g[data-object]') !== null"
 )
@@ -254,17 +255,17 @@ def axe(service: Served, browser: Browser, _given: argparse.Namespace) -> Iterat
     service.end("/v1/missions", {"file": "inspect"})
     name = service.client.get("/v1/missions")["missions"][0]["name"]
     pages = {
-        **{service.console_url + path: ".top .quiet" for path in CONSOLE_PAGES},
-        **{service.url + path: sign for path, sign in OWN_PAGES.items()},
-        f"{service.url}/v1/missions/{name}/report.html": ".appendix",
+        **{service.console_url + path: CONNECTED for path in CONSOLE_PAGES},
+        **{service.url + path: f"document.querySelector('{sign}') !== null" for path, sign in OWN_PAGES.items()},
+        f"{service.url}/v1/missions/{name}/report.html": "document.querySelector('.appendix') !== null",
     }
     found: list[str] = []
     for width, height in SIZES:
         for scheme in SCHEMES:
             page = new_page(browser, width=width, height=height, scheme=scheme, bypass_csp=True)
-            for url, sign in pages.items():
+            for url, is_there in pages.items():
                 page.goto(url)
-                until(page, f"document.querySelectorAll('{sign}').length")
+                until(page, is_there)
                 page.wait_for_timeout(1000)
                 found += [f"{url} {width} {scheme}: {barrier}" for barrier in barriers(page)]
             page.context.close()

@@ -26,6 +26,7 @@ LIFT_M = 0.0015
 GRIPS_N = (12.0, 18.0, 26.0)  # of the tries; low at first, because 40 N doubles the force peaks
 TURN_M_PER_S = 0.12
 PLAY_RAD = 0.08
+MOST_GIVE_RAD = 0.15  # that the hand turns further for pads that yield; .01 to .08 rad were felt on 40 random selectors
 FELT_RATIO = 0.85  # of the largest torque; where it is reached first, the bar gives way
 RESISTS_RATIO, SNAP_RATIO = (
     0.6,
@@ -128,14 +129,18 @@ def turn_bar(
     bar_m = selector.bar_width_m
     open_m = bar_m + 2.0 * SIDE_M
     seat = selector.height_m / 2  # the shoulder under the bar
-    _hold(attempt, selector, [_way(selector, start_rad, goal_rad, seat, flip) for flip in (0.0, np.pi)], open_m, grip_n)
-    start = attempt.pose()
     sign = float(np.sign(goal_rad - start_rad))
     span_rad = abs(goal_rad - start_rad) + over_rad  # the detent pulls the knob back into place
+    most_give_rad = min(MOST_GIVE_RAD, 0.5 * span_rad) if detents else 0.0
+    furthest_rad = start_rad + sign * (span_rad + most_give_rad)
+    ways = [_way(selector, start_rad, furthest_rad, seat, flip) for flip in (0.0, np.pi)]
+    _hold(attempt, selector, ways, open_m, grip_n)
+    start = attempt.pose()
     reports = [_turn(attempt, start, sign * span_rad)]
     felt = _felt(reports, sign)
     if detents and reports[0].tripped is None:
-        reports.append(_turn(attempt, attempt.pose(), sign * _give_rad(attempt, reports[0], felt, span_rad)))
+        give_rad = min(_give_rad(attempt, reports[0], felt), most_give_rad)
+        reports.append(_turn(attempt, attempt.pose(), sign * give_rad))
         felt = _felt(reports, sign)
     end = reports[-1]
     turned = float(np.linalg.norm((end.base_from_tool.rotation * start.rotation.inv()).as_rotvec()))
@@ -156,7 +161,7 @@ def _hold(
     attempt: Attempt, selector: Rotary | Knob, ways: list[list[RigidTransform]], open_m: float, grip_n: float
 ) -> None:
     seat = selector.height_m / 2
-    attempt.begin(ways, may_touch=(selector.name,), width_m=open_m, name=selector.name)
+    attempt.begin(ways, may_touch=(selector.name,), width_m=open_m, name=selector.name, leans_about=(0,))
     down = attempt.advance(
         STANDOFF_M + selector.height_m - seat + 0.004, name="approach", speed_m_per_s=0.04, stop_n=SEAT_N
     )
@@ -186,7 +191,7 @@ def _felt(reports: list[MotionReport], sign: float) -> Array:
     return np.concatenate([-sign * report.log.wrench[:, 5] for report in reports])
 
 
-def _give_rad(attempt: Attempt, report: MotionReport, torque_nm: Array, span_rad: float) -> float:
+def _give_rad(attempt: Attempt, report: MotionReport, torque_nm: Array) -> float:
     """Return by what turn of the hand the pads yield before the bar follows: up to where the torque is nearly largest."""
     most = float(np.percentile(torque_nm, 98.0))
     if most < LEAST_NM:
@@ -194,8 +199,7 @@ def _give_rad(attempt: Attempt, report: MotionReport, torque_nm: Array, span_rad
     k = int(np.argmax(torque_nm >= FELT_RATIO * most))
     context = attempt.context
     first, then = (context.kinematics.tool(q, context.flange_from_grip) for q in report.log.positions_rad[[0, k]])
-    turned = float(np.linalg.norm((then.rotation * first.rotation.inv()).as_rotvec()))
-    return min(turned, 0.5 * span_rad)
+    return float(np.linalg.norm((then.rotation * first.rotation.inv()).as_rotvec()))
 
 
 def detents_passed(torque_nm: Array) -> int:
@@ -210,10 +214,8 @@ def detents_passed(torque_nm: Array) -> int:
     return count
 
 
-def _way(
-    selector: Rotary | Knob, start_rad: float, goal_rad: float, seat_m: float, flip: float
-) -> list[RigidTransform]:
+def _way(selector: Rotary | Knob, start_rad: float, end_rad: float, seat_m: float, flip: float) -> list[RigidTransform]:
     x, y = selector.position_m
-    steps = np.linspace(start_rad, goal_rad, max(3, int(abs(goal_rad - start_rad) / 0.1)))
+    steps = np.linspace(start_rad, end_rad, max(3, int(abs(end_rad - start_rad) / 0.1)))
     down = [panel_from_grip((x, y, seat_m + LIFT_M), flip - float(a)) for a in steps]
     return [panel_from_grip((x, y, selector.height_m + STANDOFF_M), flip - start_rad), *down]

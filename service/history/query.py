@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,7 +72,10 @@ class Bucket:
 
 
 class Reader:
-    """Reads the database and the Parquet parts as one history.
+    """Reads the database and the Parquet parts as one history; any thread may ask.
+
+    Connections stay open for the next questions, as many as were asked at once: to open one needs the interpreter eight times,
+    which a mission keeps busy.
 
     Args:
         path: the SQLite file.
@@ -82,6 +85,13 @@ class Reader:
     def __init__(self, path: Path, parts: Path) -> None:
         self._path = path
         self._parts = parts
+        self._idle: list[sqlite3.Connection] = []
+
+    def close(self) -> None:
+        """Close the connections that wait for questions; a later question opens one again."""
+        idle, self._idle = self._idle, []  # a connection that answers now returns to the old list, and is forgotten
+        for db in idle:
+            db.close()
 
     def page(self, query: Query, *, after: int = 0, limit: int = MOST_ROWS) -> list[Row]:
         """Return at most `limit` readings with an id above `after`, in the order in which they were stored.
@@ -92,12 +102,13 @@ class Reader:
         """
         where, values = query.where("id > ?")
         tail = f"{where} ORDER BY id LIMIT {int(limit)}"
+        live = f"SELECT {SELECTED} FROM readings {tail}"
         with self._open() as db:
-            rows = read_parts(self._older(db, after=after), SELECTED, tail, [*values, after])
-            if len(rows) < limit:
-                live = f"SELECT {SELECTED} FROM readings {where} ORDER BY id LIMIT ?"
-                rows += db.execute(live, [*values, after, limit - len(rows)]).fetchall()
-        return [_row(row) for row in rows]
+            rows = db.execute(live, [*values, after]).fetchall()
+            if parts_of(self._parts):  # else all of the history was in that one answer
+                rows = read_parts(self._older(db, after=after), SELECTED, tail, [*values, after])
+                rows += db.execute(live, [*values, after]).fetchall()
+        return [_row(row) for row in rows[:limit]]
 
     def last(self, query: Query, *, limit: int) -> list[Row]:
         """Return the newest `limit` readings, in the order in which they were stored.
@@ -106,12 +117,13 @@ class Reader:
             HistoryError, Unsupported: as for `page`.
         """
         where, values = query.where()
+        tail = f"{where} ORDER BY id DESC LIMIT {int(limit)}"
+        live = f"SELECT {SELECTED} FROM readings {tail}"
         with self._open() as db:
-            live = f"SELECT {SELECTED} FROM readings {where} ORDER BY id DESC LIMIT ?"
-            rows = db.execute(live, [*values, limit]).fetchall()
-            if len(rows) < limit:
-                tail = f"{where} ORDER BY id DESC LIMIT {int(limit) - len(rows)}"
-                rows += read_parts(self._older(db), SELECTED, tail, values)
+            rows = db.execute(live, values).fetchall()
+            if len(rows) < limit and parts_of(self._parts):
+                rows = read_parts(self._older(db), SELECTED, tail, values)
+                rows += db.execute(live, values).fetchall()
         return [_row(row) for row in sorted(rows, key=lambda row: int(row[0]))[-limit:]]
 
     def all(self, query: Query) -> Iterator[Row]:
@@ -192,22 +204,36 @@ class Reader:
 
     def _older(self, db: sqlite3.Connection, *, after: int = 0) -> list[Path]:
         """Return the parts with readings above `after` that are not in the database any more."""
+        db.execute("BEGIN")  # a snapshot from here on, and the parts are listed after it: a reading is never in neither
         first = db.execute("SELECT MIN(id) FROM readings").fetchone()[0]
         ids = [(part, *ids_of(part)) for part in parts_of(self._parts)]
         return [part for part, _, last in ids if last > after and (first is None or last < first)]
 
-    def _open(self) -> closing[sqlite3.Connection]:
-        uri = f"{self._path.absolute().as_uri()}?mode=ro"
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        """Yield a connection for one answer."""
+        idle = self._idle
         try:
-            db = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=5.0)
-            db.execute("BEGIN")  # one snapshot for the whole answer
-            db.execute("SELECT 1 FROM readings LIMIT 1").fetchone()
+            with ExitStack() as unless_answered:
+                db = self._one_of(idle)
+                unless_answered.callback(db.close)
+                yield db
+                if db.in_transaction:
+                    db.execute("COMMIT")
+                unless_answered.pop_all()
         except sqlite3.Error as error:
             raise HistoryError(
                 f"the history {self._path} cannot be read: {error}",
                 hint="see the service's log; a damaged file is set aside at the next start",
             ) from error
-        return closing(db)
+        idle.append(db)
+
+    def _one_of(self, idle: list[sqlite3.Connection]) -> sqlite3.Connection:
+        """Return one of the open connections, or a new one where all of them answer."""
+        with suppress(IndexError):
+            return idle.pop()
+        uri = f"{self._path.absolute().as_uri()}?mode=ro"
+        return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=5.0)
 
 
 def _sums(number: str) -> str:

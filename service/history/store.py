@@ -62,6 +62,7 @@ class History:
         self._lock = threading.Lock()
         self._adds, self._trimmed_s = 0, float("-inf")
         self.version = 0  # rises with all that is stored
+        self._reader = Reader(self.path, self._parts)
         self._db, aside = open_history(self.path)
         self.set_aside_now = aside
         if aside is not None:
@@ -74,8 +75,8 @@ class History:
         return set_aside_beside(self.path)
 
     def reader(self) -> Reader:
-        """Return what answers questions; each question opens the files by itself."""
-        return Reader(self.path, self._parts)
+        """Return what answers questions."""
+        return self._reader
 
     def ask(self, **given: object) -> Query:
         """Return a question about this cell; see `Query`."""
@@ -154,6 +155,7 @@ class History:
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         with self._lock:
+            self._reader.close()
             self._db.close()
 
     def trim(self) -> None:
@@ -189,6 +191,7 @@ class History:
 
     def _begin_anew(self) -> None:
         """Set the damaged file aside and begin a new one."""
+        self._reader.close()
         with suppress(sqlite3.Error):
             self._db.close()
         self._db, aside = open_history(self.path)

@@ -21,7 +21,7 @@ from hal.errors import CellError, ConfigError, DeviceError
 from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
 from hal.motion import CellSignals
-from hal.priorities import raise_session
+from hal.priorities import SWITCH_S, raise_session
 from hal.process_state import MOVES, set_memory_priority
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
 
 CLOSE_TIMEOUT_S = 4.0
 WAY_BACK_S = 10.0  # the arm's way back without a service, and its rest
-SWITCH_S = 0.0005  # interpreter switch interval: the longest that the control thread waits for another thread
 NO_WATCH = ControlWatch(lambda: None)
 log = logging.getLogger(__name__)
 

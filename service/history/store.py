@@ -21,7 +21,7 @@ from service.history.reading import COLUMNS, StoredReading
 
 DAY_S = 86_400.0
 TRIM_EVERY_S = 3600.0  # between two looks at the age of the oldest reading
-TRIM_EVERY_ADDS = 100  # between two looks at the size
+TRIM_EVERY_ADDS = 1000  # between two looks at the size
 TRIM_SHARE = 0.1  # of the readings leave at once when the file is too large
 ALL = ("id", "cell", "panel", *COLUMNS)
 ROW = f"({', '.join('?' * (2 + len(COLUMNS)))})"

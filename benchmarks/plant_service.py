@@ -59,6 +59,22 @@ while True:
                 number = part.split(b'"value":', 1)[1].split(b",", 1)[0].decode()
                 seen.setdefault(number, []).append(now_s)
 """
+DISK = """
+import json, os, select, sys, time
+try:
+    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(50))
+except OSError:
+    pass
+file, times = os.open(sys.argv[1], os.O_RDWR | os.O_CREAT), []
+os.write(file, bytes(4096 * 1000))
+os.fsync(file)
+while not select.select([sys.stdin], [], [], float(sys.argv[2]))[0]:
+    os.pwrite(file, os.urandom(4096), 4096 * (len(times) % 1000))
+    begun = time.monotonic()
+    os.fdatasync(file)
+    times.append(time.monotonic() - begun)
+print(json.dumps(times), flush=True)
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,12 +86,14 @@ class Durable:
         first_s: until the first of the followers is told, over HTTP.
         each_s: until a follower is told, one entry a follower.
         floor_s: as `each_s`, from a server that does nothing but write to the followers, with nothing else running.
+        disk_s: until 4 kB are on disk, of a process with real-time priority that does nothing else, beside all of this.
     """
 
     stored_s: tuple[float, ...]
     first_s: tuple[float, ...]
     each_s: tuple[float, ...]
     floor_s: tuple[float, ...]
+    disk_s: tuple[float, ...]
     missions: int
     clients: int
     outlets: tuple[str, ...]
@@ -93,9 +111,9 @@ def durable(*, missions: int = 3, clients: int = 50, inline: bool = False) -> Du
             if not inline:
                 wait_for_outlets(outlets)
             port = int(panelwright.url.rsplit(":", 1)[1])
-            with _followers(port, "/v1/feed/events", clients) as told:
+            with _followers(port, "/v1/feed/events", clients) as told, _disk(Path(folder) / "disk") as written:
                 begun_s, stored_s = _probed(panelwright, missions)
-                seen = told()
+                disk_s, seen = written(), told()
         finally:
             panelwright.close()
     each = _delays(begun_s, seen, clients)
@@ -104,6 +122,7 @@ def durable(*, missions: int = 3, clients: int = 50, inline: bool = False) -> Du
         first_s=tuple(min(one) for one in each),
         each_s=tuple(x for one in each for x in one),
         floor_s=floor,
+        disk_s=tuple(disk_s),
         missions=missions,
         clients=clients,
         outlets=tuple(outlets.model_dump(exclude_none=True)),
@@ -128,6 +147,22 @@ def _followers(port: int, path: str, count: int) -> Iterator[Callable[[], dict[s
             if process.stdout.readline().strip() != "ready":
                 raise RuntimeError("the followers cannot follow")
             yield told
+        finally:
+            process.kill()
+
+
+@contextmanager
+def _disk(file: Path) -> Iterator[Callable[[], list[float]]]:
+    """Write 4 kB again and again in a process of its own; yields what ends it and returns how long each took to the disk."""
+    command = [sys.executable, "-P", "-c", DISK, str(file), str(PROBE_S)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+
+        def written() -> list[float]:
+            times: list[float] = json.loads(process.communicate("end\n")[0])
+            return times
+
+        try:
+            yield written
         finally:
             process.kill()
 

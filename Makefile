@@ -15,7 +15,7 @@ $(BIN)/uv pip install --quiet --python $(BIN)/python -c hashes.txt $(1) 2>.venv/
     echo "setup: pip takes over from uv"; $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt $(1); }
 endef
 
-.PHONY: docs help setup warm test-packages demo serve test test-wire test-fast test-planted lint lint-style lint-types lint-layers lint-security hashes sbom format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
+.PHONY: docs pictures help setup warm test-packages demo serve test test-wire test-fast test-planted lint lint-style lint-types lint-layers lint-security hashes sbom format bench-cell bench-missions bench-pose bench-fusion bench-range bench-vision bench-cables bench-drivers clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
@@ -88,6 +88,8 @@ sbom: setup  ## Write build/sbom.json, the parts of this installation (CycloneDX
 docs: setup  ## Build the pages into site/, with search
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet && echo "docs: open site/index.html"
 
+pictures: setup  ## Take the pictures of the console in docs/ again (ten minutes)
+	@$(BIN)/python -m tests.docs.console_pictures
 
 format: setup  ## Put the code into shape
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .

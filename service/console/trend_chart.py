@@ -160,7 +160,7 @@ def _series(trend: Trend, colour: str, axis: int) -> Iterator[dict[str, Any]]:
 def _limits(one: PanelObject, colour: str, *, is_left: bool) -> Iterator[dict[str, Any]]:
     for name, value in one.limits.given.items() if one.limits is not None else ():
         told = say("history.limit", label=label_of(one), limit=name.replace("_", "-"))
-        label = {"formatter": told, "position": "insideStartTop" if is_left else "insideEndTop", "color": INK}
+        label = {"formatter": told, "position": "insideStartBottom" if is_left else "insideEndTop", "color": INK}
         yield {"yAxis": _factor(one) * value, "label": label, "lineStyle": {"color": colour, "type": "dashed"}}
 
 

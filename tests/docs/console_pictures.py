@@ -1,24 +1,29 @@
-"""Renews the pictures of the console's pages: `python -m benchmarks.console_pictures [--runs FOLDER] [--out docs/images/console]`.
+"""Takes the pictures of the console's pages that the documentation shows: `make pictures` renews those in `docs/images/console`.
 
-Starts the real service on the simulated bench cell, runs the demo mission, and takes each page in headless Chromium. Those of the
-documentation show a week: `panelwright demo --week`, then `--runs runs/week --cell runs/week/plant/cells/bench.toml`. `--all` takes
-each page in light and dark, 1440 and 390 pixels wide.
+Runs a simulated week of rounds, starts the real service on what it leaves, and takes each page in headless Chromium.
+`python -m tests.docs.console_pictures --all --out FOLDER` takes each page in light and dark, 1440 and 390 pixels wide.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from benchmarks.console_served import Served, new_page, served, until
+from hal.arrays import Image
 from tests.service.browser import CHROMIUM, FLAGS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
+PICTURES_OF_DOCS = ROOT / "docs/images/console"
 SHOWN = (("", 1440, 900, "light"), ("-telephone", 390, 844, "dark"))
 OTHERS = (("-dark", 1440, 900, "dark"), ("-telephone-light", 390, 844, "light"))
 QUALITY = 70
@@ -28,38 +33,48 @@ SETTLE_MS = 2500.0
 def main(arguments: Sequence[str] | None = None) -> int:
     """Take the pictures and print their sizes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs/images/console")
-    parser.add_argument("--runs", type=Path, help="folder of an earlier service, whose history is shown")
+    parser.add_argument("--out", type=Path, default=PICTURES_OF_DOCS)
+    parser.add_argument("--days", type=float, default=7.0, help="length of the simulated week")
     parser.add_argument("--only", default=",".join(PICTURES))
-    parser.add_argument("--all", action="store_true", help="every page in every look")
-    parser.add_argument("--cell", type=Path, default=ROOT / "cells/bench.toml")
+    parser.add_argument("--all", action="store_true", help="every page in every look, in its whole length")
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
-    with served(given.cell, runs=given.runs) as service, sync_playwright() as play:
-        if given.runs is None:
-            service.end("/v1/missions", {"file": "demo"})
-        else:
-            service.end("/v1/panel-pose", {})
-        browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+    with after_a_week(given.days) as (service, browser):
         for name in given.only.split(","):
-            path, prepare = PICTURES[name]
             for suffix, width, height, scheme in (*SHOWN, *OTHERS) if given.all else SHOWN:
+                path = given.out / f"{name}{suffix}.webp"
                 page = new_page(browser, width=width, height=height, scheme=scheme)
-                page.goto(service.console_url + path)
-                until(page, "document.querySelector('.top .quiet').textContent.includes('panel')")
-                prepare(page, service)
-                page.wait_for_timeout(SETTLE_MS)
-                _write(page, given.out / f"{name}{suffix}.webp", whole=given.all)
-                page.context.close()
-        browser.close()
+                pixels = taken(page, service, name, whole=given.all)
+                cv2.imwrite(str(path), pixels, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+                print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
     return 0
 
 
-def _write(page: Page, path: Path, *, whole: bool) -> None:
+@contextmanager
+def after_a_week(days: float) -> Iterator[tuple[Served, Browser]]:
+    """Start the service on the history of a simulated week, or of so many days, and a browser."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "service.cli", "demo", "--week", "--days", str(days), "--runs", folder]
+        subprocess.run(command, cwd=ROOT, check=True)
+        runs = Path(folder) / "week"
+        with served(runs / "plant/cells/bench.toml", runs=runs) as service, sync_playwright() as play:
+            service.end("/v1/panel-pose", {})
+            browser = play.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+            yield service, browser
+            browser.close()
+
+
+def taken(page: Page, service: Served, name: str, *, whole: bool = False) -> Image:
+    """Show what a picture is of on a new page, and return it as BGR pixels; the page is closed afterwards."""
+    path, prepare = PICTURES[name]
+    page.goto(service.console_url + path)
+    until(page, "document.querySelector('.top .quiet').textContent.includes('panel')")
+    prepare(page, service)
+    page.wait_for_timeout(SETTLE_MS)
     pixels = cv2.imdecode(np.frombuffer(page.screenshot(full_page=whole), np.uint8), cv2.IMREAD_COLOR)
+    page.context.close()
     assert pixels is not None  # the browser wrote it
-    cv2.imwrite(str(path), pixels, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
-    print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
+    return np.asarray(pixels, dtype=np.uint8)
 
 
 def _nothing(_page: Page, _service: Served) -> None:

@@ -26,8 +26,8 @@ SWITCH_S = 0.00003
 """How long a thread that needs Python's lock waits before it asks the one that computes for it (`sys.setswitchinterval`).
 
 Python's own 5 ms, or the 1 ms that a service had, are waited out at each call that lets go of the lock, of which one stored reading
-makes a dozen. With .03 ms, the history waits a third as long beside a mission as with 1 ms and the event loop half as long, and a
-mission takes no longer."""
+makes a dozen. With .03 ms, the history and the event loop wait less than half as long beside a mission as with 1 ms, and a mission
+takes no longer."""
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}  # numbers of the system call sched_setattr
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,8 @@ def raise_session() -> None:
 
     Threads of one Python process wait for the one that computes, also those with a real-time priority. Beside ten browsers on the
     same two cores, 30 of 1000 timers of the event loop were more than 10 ms late during a mission, 14 with a niceness of -10, and
-    8 with -20.
+    8 with -20 (3 with `SWITCH_S` as it is). A cell in which time is simulated computes as much as it is given and does not ask
+    for this.
     """
     if os.getsid(0) != os.getpid():
         return  # the session of a person's shell, in which much else may run

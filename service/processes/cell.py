@@ -276,7 +276,6 @@ def main() -> None:
     """Run the cell process; this is its entry point."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
     sys.setswitchinterval(SWITCH_S)
-    raise_session()
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     set_memory_priority(MOVES)  # as its parent had it before it began to compute
     import hal.jit  # noqa: F401 - the simulated world needs it too, and takes it from here
@@ -306,6 +305,8 @@ def _run(order: CellOrder, lifeline: Lifeline, latch: Latch, vigil: Vigil) -> No
 
     swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
     cell = load_cell(Path(order.cell_path), seed=order.seed)
+    if cell.file.cell.mode != "sim":  # a simulated world has its own time, and computes as much as it is given
+        raise_session()
     runs_dir = None if order.runs_dir is None else Path(order.runs_dir)
     runtime = CellRuntime.start(
         cell,

@@ -25,8 +25,7 @@ import numpy as np
 from hal.config import load_cell
 from hal.gc_freeze import freeze_loaded
 from hal.motion import Hold, JointTrajectory
-from hal.priorities import SWITCH_S
-from service.processes.cell import CellRuntime
+from service.processes.cell import SWITCH_S, CellRuntime
 from service.processes.latch import Latch
 
 SPAN_RAD = 1.0

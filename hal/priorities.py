@@ -21,13 +21,7 @@ from pathlib import Path
 # struct sched_attr of linux/sched/types.h: size, policy, flags, niceness, priority, runtime (ns), deadline, period
 ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 SESSION = Path("/proc/self/autogroup")
-SESSION_NICENESS = -20
-SWITCH_S = 0.00003
-"""How long a thread that needs Python's lock waits before it asks the one that computes for it (`sys.setswitchinterval`).
-
-Python's own 5 ms, or the 1 ms that a service had, are waited out at each call that lets go of the lock, of which one stored reading
-makes a dozen. With .03 ms, the history and the event loop wait less than half as long beside a mission as with 1 ms, and a mission
-takes no longer."""
+SERVICE_NICENESS, CELL_NICENESS = -20, -10  # of their sessions
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}  # numbers of the system call sched_setattr
 log = logging.getLogger(__name__)
 
@@ -69,18 +63,17 @@ def take_priority(priority: Priority) -> None:
     ctypes.CDLL(None).syscall(call, 0, attributes, 0)
 
 
-def raise_session() -> None:
+def raise_session(niceness: int) -> None:
     """Let the session that this process leads come before those of other programs, if the system knows this and permits it.
 
     Threads of one Python process wait for the one that computes, also those with a real-time priority. Beside ten browsers on the
     same two cores, 30 of 1000 timers of the event loop were more than 10 ms late during a mission, 14 with a niceness of -10, and
-    8 with -20 (3 with `SWITCH_S` as it is). A cell in which time is simulated computes as much as it is given and does not ask
-    for this.
+    8 with -20. A cell in which time is simulated computes as much as it is given and does not ask for this.
     """
     if os.getsid(0) != os.getpid():
         return  # the session of a person's shell, in which much else may run
     with suppress(OSError):
-        SESSION.write_text(str(SESSION_NICENESS))
+        SESSION.write_text(str(niceness))
 
 
 def ask_for_realtime(priority: int) -> bool:

@@ -21,7 +21,7 @@ from benchmarks.drivers.stamps import part_stamps
 from benchmarks.drivers.swap import part_swap
 from benchmarks.drivers.wire import part_decode, part_latency
 from hal.gc_freeze import freeze_loaded
-from hal.priorities import SWITCH_S
+from service.processes.cell import SWITCH_S
 
 PARTS: dict[str, Callable[[float], None]] = {
     "latency": part_latency,

@@ -31,7 +31,6 @@ from benchmarks.drivers.stamps import stamp_errors_s
 from hal.entry_points import registered
 from hal.errors import CellError
 from hal.gc_freeze import freeze_loaded
-from hal.priorities import SWITCH_S
 from hal.registry import DEVICES
 from service.commissioning.driver_options import describe
 from service.commissioning.driver_records import (
@@ -47,6 +46,7 @@ from service.commissioning.driver_records import (
     tier_of,
     write_record,
 )
+from service.processes.cell import SWITCH_S
 
 ROOT = Path(__file__).parents[2]
 RECORDS = ROOT / "drivers" / "records"

@@ -21,7 +21,7 @@ from hal.errors import CellError, ConfigError, DeviceError
 from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
 from hal.motion import CellSignals
-from hal.priorities import SWITCH_S, raise_session
+from hal.priorities import CELL_NICENESS, raise_session
 from hal.process_state import MOVES, set_memory_priority
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 
 CLOSE_TIMEOUT_S = 4.0
 WAY_BACK_S = 10.0  # the arm's way back without a service, and its rest
+SWITCH_S = 0.0005  # interpreter switch interval: the longest that the control thread waits for another thread
 NO_WATCH = ControlWatch(lambda: None)
 log = logging.getLogger(__name__)
 
@@ -306,7 +307,7 @@ def _run(order: CellOrder, lifeline: Lifeline, latch: Latch, vigil: Vigil) -> No
     swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
     cell = load_cell(Path(order.cell_path), seed=order.seed)
     if cell.file.cell.mode != "sim":  # a simulated world has its own time, and computes as much as it is given
-        raise_session()
+        raise_session(CELL_NICENESS)
     runs_dir = None if order.runs_dir is None else Path(order.runs_dir)
     runtime = CellRuntime.start(
         cell,

@@ -11,7 +11,7 @@ import threading
 
 import pytest
 
-from hal.priorities import ATTRIBUTES, CALLS, SESSION, SESSION_NICENESS, Priority, take_priority
+from hal.priorities import ATTRIBUTES, CALLS, SERVICE_NICENESS, SESSION, Priority, take_priority
 
 pytestmark = pytest.mark.skipif(platform.machine() not in CALLS, reason="the system call is not known here")
 
@@ -75,7 +75,8 @@ def test_stop_and_answers_are_real_time_where_that_is_allowed_and_else_keep_thei
 
 
 @pytest.mark.parametrize(
-    ("work", "given"), [("take_priority(Priority.CLIENT)", "5"), ("raise_session()", str(SESSION_NICENESS))]
+    ("work", "given"),
+    [("take_priority(Priority.CLIENT)", "5"), ("raise_session(SERVICE_NICENESS)", str(SERVICE_NICENESS))],
 )
 def test_a_process_gives_its_niceness_to_the_session_that_it_leads_and_to_no_other(work: str, given: str) -> None:
     program = f"from hal.priorities import *; {work}; print(SESSION.read_text())"

@@ -26,7 +26,7 @@ LIFT_M = 0.0015
 GRIPS_N = (12.0, 18.0, 26.0)  # of the tries; low at first, because 40 N doubles the force peaks
 TURN_M_PER_S = 0.12
 PLAY_RAD = 0.08
-MOST_GIVE_RAD = 0.15  # that the hand turns further for pads that yield; .01 to .08 rad were felt on 40 random selectors
+MOST_GIVE_RAD = 0.15  # that the hand turns further for pads that yield; .01 to .08 rad were felt on 10 random selectors
 FELT_RATIO = 0.85  # of the largest torque; where it is reached first, the bar gives way
 RESISTS_RATIO, SNAP_RATIO = (
     0.6,

@@ -98,9 +98,9 @@ def control_probe(latch: Path, *, rate_hz: float, prefix: Sequence[str] = ()) ->
     path = os.pathsep.join([str(FAKES), root])
     command = [*prefix, sys.executable, "-m", "benchmarks.control_probe", str(latch), str(rate_hz)]
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    # In a session of its own, as a cell process is: Linux shares the processors out to sessions first.
+    # In the session of its parent, as a cell process is.
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, process_group=0
     ) as process:
         probe = ControlProbe(process)
         assert probe._told() == "ready"

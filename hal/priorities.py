@@ -1,9 +1,11 @@
 """The table of what runs first where processors are busy; most of it needs no privileges.
 
-Linux may share the processors between sessions first, and then within each of them (`sched_autogroup_enabled`). The niceness
-of a process that leads a session is therefore given to the session, too. Linux gives every thread turns. From version 6.12
-on, a thread may ask for short turns: it gets no more time of a processor than before, but when it wakes it interrupts
-threads with longer turns instead of waiting until theirs are over.
+Linux gives every thread turns. From version 6.12 on, a thread may ask for short turns: it gets no more time of a processor than
+before, but when it wakes it interrupts threads with longer turns instead of waiting until theirs are over.
+
+Linux may share the processors between sessions first, and then within each of them (`sched_autogroup_enabled`). What a session
+that mostly sleeps is owed is reckoned coarsely: a loop at 125 Hz that was alone in its session waited up to 30 ms for its turn, and
+up to 6 ms in the session of those that kept the processors busy. All processes of a service therefore share its session.
 """
 
 from __future__ import annotations
@@ -21,26 +23,28 @@ from pathlib import Path
 # struct sched_attr of linux/sched/types.h: size, policy, flags, niceness, priority, runtime (ns), deadline, period
 ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 SESSION = Path("/proc/self/autogroup")
-SERVICE_NICENESS, CELL_NICENESS = -20, -10  # of their sessions
+SESSION_NICENESS = -20
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}  # numbers of the system call sched_setattr
 log = logging.getLogger(__name__)
 
 
 class Priority(Enum):
-    """What a thread asks for: added niceness, length of its turns, s, and real-time priority.
+    """What a thread asks for: niceness in addition to that of its process, length of its turns, s, and real-time priority.
 
     What it starts later inherits niceness and turns, and is not real-time. Only a privileged process gets a negative niceness or
     a real-time priority.
 
-    0.1 ms is the shortest turn that Linux gives. Beside a load of 12 on two cores, a control thread at 125 Hz then sent 7 of
-    100 set-points late instead of 11; turns of 1 ms changed nothing, nor did more niceness of the service. Ten browsers on the
-    same two cores let the event loop lag 60 ms and a stop take 12 ms (99th percentiles); real-time made that 6 to 21 and 2 ms.
+    0.1 ms is the shortest turn that Linux gives; with 0.5, 1 and 2 ms a control thread at 125 Hz sent more set-points late, not
+    fewer. Beside missions and clients on two cores it sent about 4 of 1000 late, and 20 to 40 before work was nicer. Ten browsers
+    on the same two cores let the event loop lag 60 ms and a stop take 12 ms (99th percentiles); real-time made that 6 to 21 and
+    2 ms.
     """
 
     CONTROL = (0, 0.0001, 0)  # the control thread, which has a deadline in every period
     STOP = (-10, 0.0001, 2)  # the stop process
     ANSWERS = (0, None, 1)  # the event loop of the service, which answers everybody
     CLIENT = (5, None, 0)  # console and gateway, which may be late without harm
+    WORK = (10, None, 0)  # tasks, readings and simulated worlds, which compute as much as they are given
 
 
 def take_priority(priority: Priority) -> None:
@@ -51,10 +55,7 @@ def take_priority(priority: Priority) -> None:
     if realtime_priority and ask_for_realtime(realtime_priority):
         return
     with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + more)
-    if more and os.getsid(0) == os.getpid():
-        with suppress(OSError):  # what a system without this, or without the privilege, says
-            SESSION.write_text(str(more))
+        os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, os.getpid()) + more)
     call = CALLS.get(platform.machine())
     if turn_s is None or call is None:
         return
@@ -63,17 +64,17 @@ def take_priority(priority: Priority) -> None:
     ctypes.CDLL(None).syscall(call, 0, attributes, 0)
 
 
-def raise_session(niceness: int) -> None:
+def raise_session() -> None:
     """Let the session that this process leads come before those of other programs, if the system knows this and permits it.
 
     Threads of one Python process wait for the one that computes, also those with a real-time priority. Beside ten browsers on the
     same two cores, 30 of 1000 timers of the event loop were more than 10 ms late during a mission, 14 with a niceness of -10, and
-    8 with -20. A cell in which time is simulated computes as much as it is given and does not ask for this.
+    8 with -20.
     """
     if os.getsid(0) != os.getpid():
         return  # the session of a person's shell, in which much else may run
     with suppress(OSError):
-        SESSION.write_text(str(niceness))
+        SESSION.write_text(str(SESSION_NICENESS))
 
 
 def ask_for_realtime(priority: int) -> bool:

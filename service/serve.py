@@ -19,7 +19,7 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.gc_freeze import freeze_loaded
-from hal.priorities import SERVICE_NICENESS, raise_session
+from hal.priorities import raise_session
 from hal.process_state import COMPUTES, set_memory_priority
 from service.client import Client
 from service.commissioning.outlets import checked_outlets
@@ -226,7 +226,7 @@ class Panelwright:
     def _begin(self) -> None:
         """Start the cell in the background, because it takes seconds in which this process imports its web framework."""
         sys.setswitchinterval(SWITCH_S)
-        raise_session(SERVICE_NICENESS)
+        raise_session()
         # FastAPI hides this warning with `catch_warnings`, which imports in the cell's thread can undo meanwhile.
         warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)
         threading.Thread(target=self._start_service, name="start-cell", daemon=True).start()

@@ -82,7 +82,7 @@ class Plant:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            start_new_session=True,  # Ctrl-C is for the judge
+            process_group=0,  # Ctrl-C is for the judge
         )
         threading.Thread(target=self._listen, args=(self._process.stdout,), daemon=True).start()
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Header, Request, WebSocket
 
+from hal.priorities import Priority, take_priority
 from service.access.sessions import Sessions
 from service.core import Service
 from service.errors import Busy
@@ -57,7 +58,9 @@ class AppState:
     console_url: str | None = None
     console_secret: str | None = None
     started_s: float = field(default_factory=time.monotonic)
-    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(DEVICE_THREADS, "device-read"))
+    pool: ThreadPoolExecutor = field(
+        default_factory=lambda: ThreadPoolExecutor(DEVICE_THREADS, "device-read", take_priority, (Priority.WORK,))
+    )
     control_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(CONTROL_THREADS, "control"))
     stop_pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(STOP_THREADS, "stop"))
     _reading: int = 0

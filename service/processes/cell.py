@@ -21,7 +21,7 @@ from hal.errors import CellError, ConfigError, DeviceError
 from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
 from hal.motion import CellSignals
-from hal.priorities import CELL_NICENESS, raise_session
+from hal.priorities import Priority, take_priority
 from hal.process_state import MOVES, set_memory_priority
 from hal.registry import Context, Shared, device_factory, emulator_factory
 from hal.registry import connect as connect_device
@@ -306,8 +306,8 @@ def _run(order: CellOrder, lifeline: Lifeline, latch: Latch, vigil: Vigil) -> No
 
     swapped = {name: validate(block, DeviceSection, source=f"devices.{name}") for name, block in order.swapped.items()}
     cell = load_cell(Path(order.cell_path), seed=order.seed)
-    if cell.file.cell.mode != "sim":  # a simulated world has its own time, and computes as much as it is given
-        raise_session(CELL_NICENESS)
+    if cell.file.cell.mode == "sim":
+        take_priority(Priority.WORK)
     runs_dir = None if order.runs_dir is None else Path(order.runs_dir)
     runtime = CellRuntime.start(
         cell,

@@ -19,9 +19,10 @@ LAST_WORDS_S = 1.0
 
 
 class Child:
-    """A Python module in a process and a session of its own.
+    """A Python module in a process and a process group of its own.
 
-    As a session leader it does not receive the terminal's Ctrl-C, and killing its process group also ends its children.
+    It does not receive the terminal's Ctrl-C, and killing its group also ends its children. It stays in the session of its parent,
+    so that Linux compares their threads with each other (`hal/priorities.py`).
 
     Args:
         module: name of the module, run as by `python -m` without the current folder on the import path.
@@ -50,7 +51,7 @@ class Child:
             stdout=subprocess.PIPE,
             pass_fds=tuple(pass_fds),
             env={**os.environ, **(environment or {})},
-            start_new_session=True,
+            process_group=0,
         )
         self._lock = threading.Lock()
         self._is_killed = False
@@ -145,7 +146,7 @@ class Lifeline:
 
 
 def kill_own_group() -> NoReturn:
-    """Kill this process and all its children at once. The process must be a session leader."""
+    """Kill this process and all its children at once. The process must lead its group."""
     if os.getpgrp() == os.getpid():
         os.killpg(os.getpid(), signal.SIGKILL)
     os._exit(1)

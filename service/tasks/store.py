@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from hal.errors import Cancelled, CellError, InvalidRequest
+from hal.priorities import Priority, take_priority
 from service.access.actor import actor
 from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow, of_file
 from service.jsonable import jsonable
@@ -70,8 +71,8 @@ class TaskStore:
         self._is_closed = False
         # Motion tasks share one thread, so that two never command the arm; reading tasks do not wait for them.
         self._lanes = {
-            True: ThreadPoolExecutor(1, thread_name_prefix="task-motion"),
-            False: ThreadPoolExecutor(2, thread_name_prefix="task-read"),
+            True: ThreadPoolExecutor(1, "task-motion", take_priority, (Priority.WORK,)),
+            False: ThreadPoolExecutor(2, "task-read", take_priority, (Priority.WORK,)),
         }
 
     def start(

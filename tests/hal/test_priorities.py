@@ -8,10 +8,11 @@ import platform
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hal.priorities import ATTRIBUTES, CALLS, SERVICE_NICENESS, SESSION, Priority, take_priority
+from hal.priorities import ATTRIBUTES, CALLS, SESSION, SESSION_NICENESS, Priority, take_priority
 
 pytestmark = pytest.mark.skipif(platform.machine() not in CALLS, reason="the system call is not known here")
 
@@ -45,10 +46,12 @@ def test_the_control_thread_has_short_turns_and_its_niceness_stays() -> None:
     assert niceness_and_turn_s() == (niceness, turn_s)
 
 
-def test_a_client_is_nicer_than_its_parent() -> None:
-    niceness = os.getpriority(os.PRIO_PROCESS, 0)
+def test_clients_and_work_are_nicer_than_their_process_also_when_a_nicer_thread_starts_them() -> None:
+    niceness = os.getpriority(os.PRIO_PROCESS, os.getpid())
     assert in_a_thread(Priority.CLIENT)[0] == min(19, niceness + 5)
-    assert os.getpriority(os.PRIO_PROCESS, 0) == niceness
+    with ThreadPoolExecutor(1, "work", take_priority, (Priority.WORK,)) as pool:
+        assert pool.submit(in_a_thread, Priority.WORK).result()[0] == min(19, niceness + 10)
+    assert os.getpriority(os.PRIO_PROCESS, os.getpid()) == niceness
 
 
 @pytest.mark.parametrize(("priority", "asked"), [(Priority.STOP, 2), (Priority.ANSWERS, 1)])
@@ -74,19 +77,15 @@ def test_stop_and_answers_are_real_time_where_that_is_allowed_and_else_keep_thei
     assert turn_s == (pytest.approx(0.0001) if priority is Priority.STOP and plain[1] else plain[1])
 
 
-@pytest.mark.parametrize(
-    ("work", "given"),
-    [("take_priority(Priority.CLIENT)", "5"), ("raise_session(SERVICE_NICENESS)", str(SERVICE_NICENESS))],
-)
-def test_a_process_gives_its_niceness_to_the_session_that_it_leads_and_to_no_other(work: str, given: str) -> None:
-    program = f"from hal.priorities import *; {work}; print(SESSION.read_text())"
+def test_a_process_raises_the_session_that_it_leads_and_no_other() -> None:
+    program = "from hal.priorities import *; raise_session(); print(SESSION.read_text())"
     try:
         own = SESSION.read_text()
     except OSError:
         pytest.skip("this system does not group sessions")
     if "nice" not in own:
         pytest.skip("this system does not group sessions")
-    if given.startswith("-") and os.geteuid() != 0:
+    if os.geteuid() != 0:
         pytest.skip("only a privileged process may raise its session")
     found = [
         subprocess.run(
@@ -94,4 +93,4 @@ def test_a_process_gives_its_niceness_to_the_session_that_it_leads_and_to_no_oth
         ).stdout.split()[-1]
         for is_leader in (True, False)
     ]
-    assert found == [given, own.split()[-1]]
+    assert found == [str(SESSION_NICENESS), own.split()[-1]]

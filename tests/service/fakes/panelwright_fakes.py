@@ -57,7 +57,7 @@ class FakeDevice:
         if options.get("crash_at_connect"):
             raise ZeroDivisionError("planted defect")
         self.name = context.name
-        self._trouble = Path(options.get("trouble", "/dev/null"))
+        self._trouble = Path(options["trouble"]) if "trouble" in options else None
         self._meet_trouble()
         self._clock = context.clock
         self._is_immortal = bool(options.get("immortal"))
@@ -99,7 +99,7 @@ class FakeDevice:
         self._thawed.clear() if fault is Fault.FROZEN else self._thawed.set()
 
     def _meet_trouble(self) -> None:
-        kind = self._trouble.read_text() if self._trouble.exists() else ""
+        kind = self._trouble.read_text() if self._trouble is not None and self._trouble.exists() else ""
         if kind == "crash":
             ctypes.string_at(0)  # crashes like a C library with a bad pointer
         if kind == "away":
@@ -123,7 +123,7 @@ class FakeArm(FakeDevice):
     def __init__(self, context: Context, options: dict[str, Any]) -> None:
         super().__init__(context, options)
         self._q = np.array([0.0, -1.2, 1.6, 0.0, 0.8, 0.0])
-        self._trace = Path(options.get("trace", "/dev/null"))
+        self._trace = Path(options["trace"]) if "trace" in options else None
 
     def capabilities(self) -> ArmCapabilities:
         d = (0.40, 0.0, 0.0, 0.40, 0.0, 0.08)
@@ -156,8 +156,9 @@ class FakeArm(FakeDevice):
         self._note("stop")
 
     def _note(self, line: str) -> None:
-        with self._trace.open("a") as file:
-            file.write(f"{line}\n")
+        if self._trace is not None:
+            with self._trace.open("a") as file:
+                file.write(f"{line}\n")
 
 
 class FakeGripper(FakeDevice):

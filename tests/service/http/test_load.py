@@ -199,3 +199,13 @@ def test_the_event_loop_is_real_time_where_that_is_allowed() -> None:
         wanted = other.submit(lambda: take_priority(Priority.ANSWERS) or os.sched_getscheduler(0)).result()
     loops = [thread.native_id for thread in threading.enumerate() if thread.name == "http"]
     assert {os.sched_getscheduler(loop) for loop in loops if loop} == {wanted}
+
+
+def test_threads_that_compute_are_nicer_than_the_process(client: httpx2.Client) -> None:
+    client.get("/v1/devices/wrist_camera/reading")
+    client.post("/v1/echo?wait_s=10", json={"text": "a"})
+    nicer = min(19, os.getpriority(os.PRIO_PROCESS, os.getpid()) + 10)
+    for name in ("device-read", "task-"):
+        threads = [thread.native_id for thread in threading.enumerate() if thread.name.startswith(name)]
+        assert threads, name
+        assert {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads if thread} == {nicer}

@@ -71,6 +71,12 @@ def scene(write_cell: WriteCell, tmp_path: Path) -> Iterator[Scene]:
     running.supervisor.close()
 
 
+def test_the_processes_share_the_session_of_the_service_and_have_groups_of_their_own(scene: Scene) -> None:
+    pids = [scene.pid("cell"), scene.pid("stop")]
+    assert {os.getsid(pid) for pid in pids} == {os.getsid(0)}
+    assert [os.getpgid(pid) for pid in pids] == pids
+
+
 def test_a_suspended_stop_process_latches_the_stop_and_is_replaced(scene: Scene) -> None:
     first = scene.pid("stop")
     os.kill(first, signal.SIGSTOP)

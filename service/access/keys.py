@@ -30,6 +30,7 @@ from service.errors import KeysUnusable
 FILE = "keys.json"
 MODE = 0o600
 KEY_BYTES = 32
+RECENT_S = 0.1
 OWN, GATEWAY = "this-program", "gateway"  # names that no stored key has
 PREFIX = "pw_"  # so that scanners for secrets recognise a key
 PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}")
@@ -121,6 +122,7 @@ class KeyBook:
         self._stamp: tuple[int, ...] | None = None
         self._keys: tuple[Key, ...] = ()
         self._had_keys = False
+        self._recent: tuple[float, Keys] | None = None
         self._own_secret = _new_secret()
         self._own = Key(name=OWN, role=Role.MAINTAINER, sha256=_hash(self._own_secret), added_s=now())
         self._gateway_secret = _new_secret()
@@ -130,6 +132,14 @@ class KeyBook:
     def now(self) -> Keys:
         """Return the keys as they are now; the file is asked once. Errors as for `all`."""
         return Keys(stored=self.all(), by_hash=self._by_hash, now_s=self._now())
+
+    def recent(self) -> Keys:
+        """Return the keys as they were within the last 0.1 s, for streams, which ask before each message. Errors as for `all`."""
+        now_s = time.monotonic()
+        if self._recent is None or now_s > self._recent[0] + RECENT_S:
+            self._recent = None
+            self._recent = (now_s, self.now())
+        return self._recent[1]
 
     def all(self) -> tuple[Key, ...]:
         """Return all keys, also revoked and expired ones.
@@ -201,7 +211,7 @@ class KeyBook:
         return secret
 
     def revoke(self, name: str, *, commit: Commit) -> None:
-        """Make a key invalid at once, also for a running service.
+        """Make a key invalid at once, also for a running service, whose streams ask 0.1 s later at most.
 
         Raises:
             InvalidRequest: no active key has this name.
@@ -231,7 +241,7 @@ class KeyBook:
                 f"the file of keys {self.path} cannot be read: {type(error).__name__}",
                 hint="restore it from a backup, or delete it and add keys again",
             ) from error
-        self._by_hash = self._hashes()
+        self._by_hash, self._recent = self._hashes(), None
         self._had_keys = self._had_keys or bool(self._keys)
 
     def _hashes(self) -> dict[str, Key]:
@@ -239,6 +249,7 @@ class KeyBook:
 
     def _write(self, keys: tuple[Key, ...]) -> None:
         write_atomically(self.path, _File(keys=keys).model_dump_json(indent=1) + "\n", mode=MODE)
+        self._recent = None
 
     @contextmanager
     def _changing(self) -> Iterator[None]:

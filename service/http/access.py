@@ -113,7 +113,7 @@ def caller_with(keys: Keys, secret: str) -> Caller:
 def is_valid_still(state: AppState, caller: Caller) -> bool:
     """Return whether a stream that this caller began may tell more: its key was neither revoked nor has it expired."""
     try:
-        keys = state.service.keys.now()
+        keys = state.service.keys.recent()
     except KeysUnusable:
         return False
     key = keys.by_hash.get(caller.key_hash)

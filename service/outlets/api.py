@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import ssl
 from pathlib import Path
@@ -40,12 +41,21 @@ class ApiSource:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         self._may_acknowledge = {} if key_to_acknowledge is None else {"Authorization": f"Bearer {key_to_acknowledge}"}
         verify: ssl.SSLContext | bool = True if ca is None else trusting_only(ca)
+        self._asked: dict[tuple[Cursor, float], asyncio.Task[Changes]] = {}
         self._http = httpx2.AsyncClient(
             base_url=url, headers=headers, timeout=TIMEOUT_S, trust_env=False, verify=verify, transport=transport
         )
 
     async def changes(self, cursor: Cursor, *, wait_s: float) -> Changes:
-        """Return what came after a cursor."""
+        """Return what came after a cursor; outlets that know equally much share one request."""
+        asked = (cursor, wait_s)
+        task = self._asked.get(asked)
+        if task is None:
+            task = self._asked[asked] = asyncio.create_task(self._changes(cursor, wait_s))
+            task.add_done_callback(lambda _: self._asked.pop(asked))
+        return await asyncio.shield(task)  # one that ends must not end the request of the others
+
+    async def _changes(self, cursor: Cursor, wait_s: float) -> Changes:
         given = {"readings_after": cursor.reading, "alarms_after": cursor.alarm}
         asked = {key: value for key, value in given.items() if value is not None} | {"wait_s": wait_s}
         found = await self._get("/v1/feed", asked, timeout_s=wait_s + TIMEOUT_S)
@@ -83,6 +93,8 @@ class ApiSource:
 
     async def close(self) -> None:
         """Close its connections."""
+        for task in self._asked.values():
+            task.cancel()
         await self._http.aclose()
 
     async def _get(self, path: str, asked: dict[str, Any] | None = None, *, timeout_s: float = TIMEOUT_S) -> Any:

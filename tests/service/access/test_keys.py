@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hal.errors import ConfigError, InvalidRequest
+from service.access import keys
 from service.access.keys import KeyBook, Role, key_from_file
 from service.access.sessions import SESSION_S, Sessions
 from service.cli import _app
@@ -90,6 +91,22 @@ def test_a_change_by_another_process_counts_at_once(kept: Book) -> None:
     assert kept.book.find(secret) is not None
     KeyBook(kept.path).revoke("alice", commit=lambda *_row: None)
     assert kept.book.find(secret) is None
+
+
+def test_a_stream_is_told_of_changes_by_its_own_service_at_once_and_by_others_a_moment_later(
+    kept: Book, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keys, "RECENT_S", 60.0)
+    kept.add("alice")
+    kept.add("bob")
+    before = kept.book.recent()
+    kept.revoke("bob")
+    after = kept.book.recent()
+    assert before.named("bob") is not None and after.named("bob") is None
+    KeyBook(kept.path).revoke("alice", commit=lambda *_row: None)
+    assert kept.book.recent() is after
+    monkeypatch.setattr(keys, "RECENT_S", -1.0)
+    assert kept.book.recent().named("alice") is None
 
 
 def test_a_deleted_or_damaged_file_closes_the_service(kept: Book) -> None:

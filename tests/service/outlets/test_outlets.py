@@ -334,6 +334,34 @@ def test_the_feed_streams_what_comes_and_goes_on_after_the_last_event(
     assert client.get("/v1/feed/events", headers={"Last-Event-ID": "yesterday"}).status_code == 422
 
 
+def test_outlets_that_know_equally_much_share_one_request_that_outlives_any_of_them() -> None:
+    asked: list[str] = []
+
+    async def story() -> None:
+        both, go = asyncio.Event(), asyncio.Event()
+
+        async def answer(request: httpx2.Request) -> httpx2.Response:
+            asked.append(request.url.params.get("readings_after"))
+            if len(asked) == 2:
+                both.set()
+            await go.wait()
+            return httpx2.Response(200, json={"readings": [], "alarms": [], "readings_after": 8, "alarms_after": 3})
+
+        source = ApiSource("http://127.0.0.1:9", transport=httpx2.MockTransport(answer))
+        first, second, other = (
+            asyncio.create_task(source.changes(Cursor(reading=at, alarm=3), wait_s=5.0)) for at in (7, 7, 6)
+        )
+        await both.wait()
+        first.cancel()
+        go.set()
+        assert (await second).cursor == (await other).cursor == Cursor(reading=8, alarm=3)
+        await source.changes(Cursor(reading=7, alarm=3), wait_s=5.0)
+        await source.close()
+
+    asyncio.run(story())
+    assert sorted(asked) == ["6", "7", "7"]
+
+
 def test_an_outlet_knows_the_panel_and_acknowledges_and_comments_as_the_service_allows(served: Panelwright) -> None:
     plant = served.service.plant
     lamp = {"object": "pump_lamp", "kind": "lamp", "unit": ""}

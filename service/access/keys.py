@@ -135,11 +135,10 @@ class KeyBook:
 
     def recent(self) -> Keys:
         """Return the keys as they were within the last 0.1 s, for streams, which ask before each message. Errors as for `all`."""
-        now_s = time.monotonic()
-        if self._recent is None or now_s > self._recent[0] + RECENT_S:
-            self._recent = None
-            self._recent = (now_s, self.now())
-        return self._recent[1]
+        now_s, found = time.monotonic(), self._recent  # which other threads forget when the keys change
+        if found is None or now_s > found[0] + RECENT_S:
+            found = self._recent = (now_s, self.now())
+        return found[1]
 
     def all(self) -> tuple[Key, ...]:
         """Return all keys, also revoked and expired ones.

@@ -35,7 +35,7 @@ class Priority(Enum):
     a real-time priority.
 
     0.1 ms is the shortest turn that Linux gives; with 0.5, 1 and 2 ms a control thread at 125 Hz sent more set-points late, not
-    fewer. Beside missions and clients on two cores it sent about 4 of 1000 late, and 20 to 40 before work was nicer. Ten browsers
+    fewer. Beside missions and clients on two cores it sent about 5 of 1000 late, and 20 to 40 before work was nicer. Ten browsers
     on the same two cores let the event loop lag 60 ms and a stop take 12 ms (99th percentiles); real-time made that 6 to 21 and
     2 ms.
     """

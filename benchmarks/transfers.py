@@ -3,9 +3,11 @@
 `python -m benchmarks.transfers [--first SEED] [--transfers N] [--peers RUNS] [--of EVERY]`
 
 A tour goes from the parking position to standoffs above random objects of a panel, with the fingers at a random turn, and
-to views of it. Before every second panel two cables hang, as a range image shows them. Plans are judged by a check every
-5 mrad. With `--peers` every `EVERY`-th transfer is also planned by OMPL (RRT-Connect and its simplifier, RUNS seeds), and
-all are timed by TOPP-RA; this needs `pip install ompl==2.0.1 toppra`.
+to views of it. As in `manipulation.skills.travel`, a goal is a pose: the nearest joint vectors are searched for quickly, and
+then thoroughly, until there is a path to one. The next transfer begins there. Before every second panel two cables hang, as
+a range image shows them. Plans are judged by a check every 5 mrad. With `--peers` every `EVERY`-th transfer is also planned
+by OMPL (RRT-Connect and its simplifier, RUNS seeds), and all are timed by TOPP-RA; this needs `pip install ompl==2.0.1
+toppra`.
 Times are CPU times of one thread.
 """
 
@@ -15,6 +17,7 @@ import argparse
 import itertools
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,9 +36,9 @@ from manipulation.planning.collision import RECHECK_RAD, CollisionModel, placed
 from manipulation.planning.hand import Hand
 from manipulation.planning.shapes import CollisionBox, floor_box, panel_boxes
 from manipulation.planning.time_parameterization import SpeedLimits
-from manipulation.planning.transfer import TransferPlanner
+from manipulation.planning.transfer import QUICK, THOROUGH, TransferPlanner
 from manipulation.skills.context import panel_from_grip
-from manipulation.skills.travel import CLEAR_M, ENOUGH_CONDITIONING
+from manipulation.skills.travel import CLEAR_M, clear_goals, near_first
 from perception.range import find_obstacles
 from service.sweep.draw import draw_panel
 from simbackend.arm_model import MODELS
@@ -50,20 +53,24 @@ SPREAD = np.array([0.06] * 3 + [0.14] * 3)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Leg:
-    """One transfer: its planner, start and goal (n,) rad."""
+    """One transfer: its planner, start (n,) rad, and the joint vectors of its goal, nearest first."""
 
     arm: str
     seed: int
     planner: TransferPlanner
     start_rad: Array
-    goal_rad: Array
+    goals_rad: list[Array]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Planned:
-    """Result for one transfer: CPU milliseconds, path length in joint space, duration; no length if it failed."""
+    """Result for one transfer: CPU milliseconds, path length in joint space, duration; no length if it failed.
+
+    `goal_rad` (n,) is where the path ends, and the nearest goal if there is none.
+    """
 
     leg: Leg
+    goal_rad: Array
     plan_ms: float
     length_rad: float
     duration_s: float
@@ -72,8 +79,8 @@ class Planned:
     path_rad: Array
 
 
-def tour(arm: str, seed: int) -> Iterator[Leg]:
-    """Yield the transfers of one tour over a random panel."""
+def tour(arm: str, seed: int) -> Iterator[Planned]:
+    """Plan the transfers of one tour over a random panel, and yield the results."""
     cell = load_cell(ROOT / "cells" / f"{CELLS[arm]}.toml").file
     rng = np.random.default_rng([seed, 20])
     panel = validate(draw_panel(seed).stated, Panel, source=f"random panel {seed}")
@@ -93,10 +100,11 @@ def tour(arm: str, seed: int) -> Iterator[Leg]:
     here = np.asarray(cell.workspace.park_rad)
     for _ in range(LEGS):
         pose = _place(panel, rng)
-        goal = _nearest(model, base_from_panel * pose * grip.inv(), here)
-        if goal is not None and model.is_clear(here, margin_m=CLEAR_M):
-            yield Leg(arm=arm, seed=seed, planner=planner, start_rad=here, goal_rad=goal)
-            here = goal
+        goals = clear_goals(model, base_from_panel * pose * grip.inv(), here)
+        if goals and model.is_clear(here, margin_m=CLEAR_M):
+            leg = Leg(arm=arm, seed=seed, planner=planner, start_rad=here, goals_rad=list(near_first(goals, here)))
+            yield (row := planned(leg))
+            here = row.goal_rad
 
 
 def _cables(panel: Panel, rng: np.random.Generator) -> Iterator[CollisionBox]:
@@ -119,40 +127,33 @@ def _place(panel: Panel, rng: np.random.Generator) -> RigidTransform:
     return panel_from_grip((*one.position_m, height), float(rng.uniform(-np.pi, np.pi)))
 
 
-def _nearest(model: CollisionModel, base_from_flange: RigidTransform, here: Array) -> Array | None:
-    found = [
-        q
-        for q in model.kinematics.inverse(base_from_flange)
-        if model.kinematics.conditioning(q) > ENOUGH_CONDITIONING and model.is_clear(q, margin_m=CLEAR_M)
-    ]
-    return min(found, key=lambda q: float(np.abs(q - here).max()), default=None)
-
-
 def planned(leg: Leg) -> Planned:
     """Plan one transfer and check it."""
     began_s = time.thread_time()
-    try:
-        motion = leg.planner.plan(leg.start_rad, leg.goal_rad)
-    except Unreachable:
-        spent_ms = 1e3 * (time.thread_time() - began_s)
-        return Planned(
-            leg=leg, plan_ms=spent_ms, length_rad=np.nan, duration_s=np.nan, is_free=False, is_straight=False,
-            path_rad=np.array([leg.start_rad, leg.goal_rad]),
-        )  # fmt: skip
+    motion, goal = None, leg.goals_rad[0]
+    for effort, goal in itertools.product((QUICK, THOROUGH), leg.goals_rad):
+        with suppress(Unreachable):
+            motion = leg.planner.plan(leg.start_rad, goal, effort=effort)
+            break
     spent_ms = 1e3 * (time.thread_time() - began_s)
+    if motion is None:
+        return Planned(
+            leg=leg, goal_rad=leg.goals_rad[0], plan_ms=spent_ms, length_rad=np.nan, duration_s=np.nan, is_free=False,
+            is_straight=False, path_rad=np.array([leg.start_rad, leg.goals_rad[0]]),
+        )  # fmt: skip
     q, model = motion.positions_rad, leg.planner.model
     free = all(model.free_fraction(a, b, margin_m=0.0, step_rad=RECHECK_RAD) == 1.0 for a, b in itertools.pairwise(q))
     length = float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum())
-    apart = float(np.linalg.norm(leg.goal_rad - leg.start_rad))
+    apart = float(np.linalg.norm(goal - leg.start_rad))
     return Planned(
-        leg=leg, plan_ms=spent_ms, length_rad=length, duration_s=float(motion.times_s[-1]), is_free=free,
+        leg=leg, goal_rad=goal, plan_ms=spent_ms, length_rad=length, duration_s=float(motion.times_s[-1]), is_free=free,
         is_straight=length < 1.0001 * apart, path_rad=q,
     )  # fmt: skip
 
 
-def legs(first: int, count: int) -> list[Leg]:
-    """Return the first `count` transfers of tours with all arms in turn."""
-    out: list[Leg] = []
+def transfers(first: int, count: int) -> list[Planned]:
+    """Plan the first `count` transfers of tours with all arms in turn."""
+    out: list[Planned] = []
     for seed in itertools.count(first):
         for arm in CELLS:
             out += tour(arm, seed)
@@ -183,10 +184,8 @@ def main() -> None:
     parser.add_argument("--peers", type=int, default=0, metavar="RUNS", help="runs of OMPL for each compared transfer")
     parser.add_argument("--of", type=int, default=4, metavar="EVERY", help="compare every so many transfers with OMPL")
     options = parser.parse_args()
-    chosen = legs(options.first, options.transfers)
-    for leg in chosen[:2]:
-        planned(leg)  # loads the compiled loops
-    rows = [planned(leg) for leg in chosen]
+    transfers(options.first, 2)  # loads the compiled loops
+    rows = transfers(options.first, options.transfers)
     print(table(rows), flush=True)
     if options.peers:
         from benchmarks.transfers_peers import against_ompl, against_toppra

@@ -19,7 +19,7 @@ from manipulation.planning.smooth_path import SmoothPath
 from manipulation.planning.time_parameterization import timed
 
 if TYPE_CHECKING:
-    from benchmarks.transfers import Leg, Planned
+    from benchmarks.transfers import Planned
 
 PLAN_S = 5.0
 POINTS = 400
@@ -87,7 +87,7 @@ def against_ompl(rows: Sequence[Planned], runs: int) -> str:
     for row in rows:
         lengths = []
         for _ in range(runs):
-            found, search_ms, simplify_ms = _ompl(row.leg)
+            found, search_ms, simplify_ms = _ompl(row)
             tried += 1
             searched.append(search_ms)
             if found is not None:
@@ -106,24 +106,24 @@ def against_ompl(rows: Sequence[Planned], runs: int) -> str:
     )
 
 
-def _ompl(leg: Leg) -> tuple[float | None, float, float]:
+def _ompl(row: Planned) -> tuple[float | None, float, float]:
     """Return the length of a simplified RRT-Connect path (None without one), and CPU milliseconds of both parts."""
     base, geometric, util = (import_module(f"ompl.{name}") for name in ("base", "geometric", "util"))
     util.setLogLevel(util.LogLevel.LOG_NONE)
-    kinematics, n = leg.planner.model.kinematics, len(leg.start_rad)
+    planner, ends = row.leg.planner, (row.leg.start_rad, row.goal_rad)
+    kinematics, n = planner.model.kinematics, len(row.goal_rad)
     space, bounds = base.RealVectorStateSpace(n), base.RealVectorBounds(n)
     for k in range(n):
         bounds.setLow(k, float(kinematics.lower_rad[k]))
         bounds.setHigh(k, float(kinematics.upper_rad[k]))
     space.setBounds(bounds)
     setup = geometric.SimpleSetup(space)
-    margin = leg.planner._margin(leg.start_rad, leg.goal_rad)
-    model = leg.planner.model
+    margin, model = planner._margin(*ends), planner.model
     setup.setStateValidityChecker(lambda q: model.is_clear(np.array([q[k] for k in range(n)]), margin_m=margin))
     setup.getSpaceInformation().setStateValidityCheckingResolution(STEP_RAD / space.getMaximumExtent())
     start, goal = space.allocState(), space.allocState()
     for k in range(n):
-        start[k], goal[k] = float(leg.start_rad[k]), float(leg.goal_rad[k])
+        start[k], goal[k] = float(ends[0][k]), float(ends[1][k])
     setup.setStartAndGoalStates(start, goal)
     setup.setPlanner(geometric.RRTConnect(setup.getSpaceInformation()))
     began_s = time.thread_time()

@@ -59,7 +59,7 @@ def plan_to_first(
     reason = "no arm configuration reaches any of the poses"
 
     def goals() -> Iterator[tuple[Array, Effort]]:
-        every = (goal for pose in base_from_flange for goal in _goals(model, pose, state.position_rad))
+        every = (goal for pose in base_from_flange for goal in clear_goals(model, pose, state.position_rad))
         for goal in islice(near_first(every, state.position_rad), MOST_TRIES):
             tried.append(goal)
             yield goal, QUICK
@@ -90,7 +90,7 @@ def reachable(context: SkillContext, base_from_flange: Sequence[RigidTransform])
     """Return the indices of the poses in which the arm touches nothing; the path there is not checked."""
     state = context.mover.state()
     model = context.collision(width_m=state.gripper_width_m)
-    return [k for k, pose in enumerate(base_from_flange) if _goals(model, pose, state.position_rad)]
+    return [k for k, pose in enumerate(base_from_flange) if clear_goals(model, pose, state.position_rad)]
 
 
 def stands_clear(context: SkillContext, room: CollisionBox) -> bool:
@@ -136,7 +136,7 @@ def near_first(goals: Iterable[Array], here: Array) -> Iterator[Array]:
     yield from far
 
 
-def _goals(model: CollisionModel, base_from_flange: RigidTransform, here: Array) -> list[Array]:
+def clear_goals(model: CollisionModel, base_from_flange: RigidTransform, here: Array) -> list[Array]:
     """Return up to three well-conditioned, collision-free arm configurations for a flange pose, nearest first."""
     found = [
         q

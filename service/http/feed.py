@@ -1,6 +1,7 @@
 """`/v1/feed`: the readings and the changes of alarms of the whole cell, in order, for programs that follow them.
 
-However many programs wait, a change costs one look at the files and one rendering; to wait costs nothing.
+However many programs wait, a change costs one look at the files and one rendering; to wait costs nothing. Those that follow
+the stream are told without a turn of the event loop for each.
 """
 
 from __future__ import annotations
@@ -8,14 +9,15 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request
 from pydantic import BaseModel, Field
 from starlette.responses import Response, StreamingResponse
+from starlette.types import Message, Send
 
 from service.http.access import StillMay
 from service.http.history import HistoryReading, reading_view
@@ -29,7 +31,8 @@ After = Annotated[
 ]
 BATCH = 200
 KEPT_LOOKS = 64  # answers that are kept until the next change, for all that know equally much
-ALIVE_S = 15.0  # a stream without news sends an empty line so often, so that both sides notice a broken connection
+ALIVE_S = 15.0  # a stream sends an empty line so often, so that both sides notice a broken connection
+ALIVE = b":\n\n"
 log = logging.getLogger(__name__)
 
 
@@ -73,13 +76,50 @@ class Found:
 
     Attributes:
         body: a `Feed` as JSON.
+        event: the same as a server-sent event.
         next: where it ends.
         is_news: whether there is anything in it.
     """
 
     body: bytes
+    event: bytes
     next: Place
     is_news: bool
+
+
+@dataclass(eq=False, slots=True, kw_only=True)
+class Follower:
+    """A program that is told all that comes after its place.
+
+    Attributes:
+        send: of its connection, as in ASGI.
+        may: whether its key is valid still.
+        is_stirred: set when it must look itself.
+    """
+
+    send: Send
+    may: Callable[[], bool]
+    place: Place
+    is_stirred: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def tell(self, found: Found) -> None:
+        """Send what was found, and wait while the connection is full."""
+        await self.send(_part(found.event if found.is_news else ALIVE))
+        self.place = found.next
+
+    def push(self, found: Found) -> bool:
+        """Send what was found at once; False where the connection is full, and nothing was sent.
+
+        A server waits before it writes, so that a send which would wait can be given up.
+        """
+        sending = self.send(_part(found.event)).__await__()
+        try:
+            next(sending)
+        except StopIteration:
+            self.place = found.next
+            return True
+        sending.close()
+        return False
 
 
 class FeedDesk:
@@ -97,6 +137,7 @@ class FeedDesk:
         self._looks: dict[Place, asyncio.Future[Found]] = {}
         self._looked_at: object = None
         self._awaited: Place | None = None  # where those stand that wait
+        self._followers: set[Follower] = set()  # those that know everything
         self._loop: asyncio.AbstractEventLoop | None = None
         self.is_closing = False
 
@@ -134,6 +175,29 @@ class FeedDesk:
             if self.is_closing:
                 return found
 
+    async def follow(self, follower: Follower) -> None:
+        """Tell a follower all that comes, until it may not be told any more or this desk closes."""
+        while not self.is_closing and follower.may():
+            news = self._news  # taken before the look, so that no change falls between the two
+            found = await self._look(follower.place)
+            if found.is_news or found.next != follower.place:
+                await follower.tell(found)
+            elif news is self._news:
+                await self._push_to(follower)
+
+    async def _push_to(self, follower: Follower) -> None:
+        """Let what comes be pushed to a follower until it must look itself or see a sign of life."""
+        follower.is_stirred.clear()
+        self._awaited = follower.place
+        self._followers.add(follower)
+        try:
+            async with asyncio.timeout(ALIVE_S):
+                await follower.is_stirred.wait()
+        except TimeoutError:
+            await follower.send(_part(ALIVE))
+        finally:
+            self._followers.discard(follower)
+
     async def _look(self, place: Place) -> Found:
         """Return what has come after a place; those that know equally much share one look until something changes."""
         version = self._version()
@@ -147,22 +211,36 @@ class FeedDesk:
 
     def _on_change(self) -> None:
         """Look for those that wait, in the thread that made the change, which must not fail by it."""
-        place, self._awaited = self._awaited, None
+        place = self._awaited
         found = None
         try:
             found = None if place is None else _found(self._plant, place)
         except Exception:
             log.exception("the feed cannot be read")  # who waits looks again, and is told
+        self._awaited = None if found is None or not self._followers else found.next
         self._call(self._wake, place, found)
 
     def _wake(self, place: Place | None, found: Found | None) -> None:
-        """Let those that wait look, with what was found for them."""
+        """Push what was found to the followers that stand there, and let the others that wait look."""
         if place is not None and found is not None and found.is_news:
             self._looks, self._looked_at = {}, self._version()
             look = self._looks[place] = asyncio.get_running_loop().create_future()
             look.set_result(found)
+        for follower in tuple(self._followers):
+            if found is None or follower.place != place or not self._has_pushed(follower, found):
+                follower.is_stirred.set()
         news, self._news = self._news, asyncio.Event()
         news.set()
+
+    def _has_pushed(self, follower: Follower, found: Found) -> bool:
+        """Return whether a follower knows now what was found; False if it must look itself."""
+        if not found.is_news:
+            return found.next == follower.place
+        try:
+            return follower.may() and follower.push(found)
+        except Exception:  # the same comes up where the follower sends itself
+            log.debug("a follower cannot be told", exc_info=True)
+            return False
 
     def _version(self) -> tuple[int, int]:
         return self._plant.history.version, self._plant.changes
@@ -221,23 +299,26 @@ async def stream_feed(
         reading, _, alarm = last_event_id.partition("-")
         begin = Place(int(reading), int(alarm))
     first = await desk.ask(begin, wait_s=0.0)  # an error is an answer, not an empty stream
-    return StreamingResponse(_events(desk, first, may), media_type="text/event-stream")
+    return _FollowerStream(desk, first, may)
 
 
-async def _events(desk: FeedDesk, first: Found, may: Callable[[], bool]) -> AsyncIterator[bytes]:
-    """Yield what was found and all that comes later; the first event also tells where the stream begins."""
-    found = first
-    yield _event(found)
-    while not desk.is_closing:
-        found = await desk.ask(found.next, wait_s=ALIVE_S)
-        if not may():
-            return
-        yield _event(found) if found.is_news else b":\n\n"
+class _FollowerStream(StreamingResponse):
+    """Sends what was found and all that comes later; the first event also tells where the stream begins."""
+
+    def __init__(self, desk: FeedDesk, first: Found, may: Callable[[], bool]) -> None:
+        super().__init__((), media_type="text/event-stream")
+        self._desk, self._first, self._may = desk, first, may
+
+    async def stream_response(self, send: Send) -> None:
+        """Send the answer; cancelled when the client leaves."""
+        await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
+        await send(_part(self._first.event))
+        await self._desk.follow(Follower(send=send, may=self._may, place=self._first.next))
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
-def _event(found: Found) -> bytes:
-    number = f"{found.next.readings_after}-{found.next.alarms_after}".encode()
-    return b"id: %b\ndata: %b\n\n" % (number, found.body)
+def _part(body: bytes) -> Message:
+    return {"type": "http.response.body", "body": body, "more_body": True}
 
 
 def _found(plant: Plant, place: Place) -> Found:
@@ -259,8 +340,10 @@ def _found(plant: Plant, place: Place) -> Found:
         if place.alarms_after is None
         else place.alarms_after,
     )
+    body = feed.model_dump_json().encode()
     return Found(
-        body=feed.model_dump_json().encode(),
+        body=body,
+        event=b"id: %d-%d\ndata: %b\n\n" % (feed.readings_after, feed.alarms_after, body),
         next=Place(feed.readings_after, feed.alarms_after),
         is_news=bool(rows or changes),
     )

@@ -16,6 +16,9 @@ from service.client import ApiError, trusting_only
 from service.outlets.source import CellState, Changes, Cursor, Deed, Instrument, instruments_of
 
 TIMEOUT_S = 10.0
+GATHER_S = (
+    0.1  # least time between requests for changes: a service that is busy answers one for many readings and outlets
+)
 
 
 class ApiSource:
@@ -42,6 +45,7 @@ class ApiSource:
         self._may_acknowledge = {} if key_to_acknowledge is None else {"Authorization": f"Bearer {key_to_acknowledge}"}
         verify: ssl.SSLContext | bool = True if ca is None else trusting_only(ca)
         self._asked: dict[tuple[Cursor, float], asyncio.Task[Changes]] = {}
+        self._next_s = 0.0  # when the next request for changes may begin, on the event loop's clock
         self._http = httpx2.AsyncClient(
             base_url=url, headers=headers, timeout=TIMEOUT_S, trust_env=False, verify=verify, transport=transport
         )
@@ -56,6 +60,9 @@ class ApiSource:
         return await asyncio.shield(task)  # one that ends must not end the request of the others
 
     async def _changes(self, cursor: Cursor, wait_s: float) -> Changes:
+        loop = asyncio.get_running_loop()
+        await asyncio.sleep(self._next_s - loop.time())
+        self._next_s = loop.time() + GATHER_S
         given = {"readings_after": cursor.reading, "alarms_after": cursor.alarm}
         asked = {key: value for key, value in given.items() if value is not None} | {"wait_s": wait_s}
         found = await self._get("/v1/feed", asked, timeout_s=wait_s + TIMEOUT_S)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import threading
 from collections.abc import Iterator
 from typing import Any
 
 import httpx2
 import pytest
+from starlette.types import Message
 
 from service.http import feed as feed_module
-from service.http.feed import Found, Place
+from service.http.feed import Follower, Found, Place
 from service.plant import Plant
 from service.serve import Panelwright
 from tests.service.history.test_store import reading
@@ -99,3 +101,49 @@ def test_the_feed_streams_what_comes_and_goes_on_after_the_last_event(
         _, body = next(events(answer.iter_lines()))
         assert [one["value"] for one in body["readings"]] == [1.5, 2.5]
     assert client.get("/v1/feed/events", headers={"Last-Event-ID": "yesterday"}).status_code == 422
+
+
+def test_a_follower_whose_connection_is_full_is_given_nothing_until_it_takes_again() -> None:
+    sent: list[bytes] = []
+    known, news = Place(3, 0), Place(4, 0)
+    found = Found(body=b"{}", event=b"id: 4-0\ndata: {}\n\n", next=news, is_news=True)
+
+    async def story() -> None:
+        takes = asyncio.Event()
+
+        async def send(message: Message) -> None:  # as uvicorn: it waits first, then it writes
+            await takes.wait()
+            sent.append(message["body"])
+
+        follower = Follower(send=send, may=lambda: True, place=known)
+        assert not follower.push(found)
+        assert (sent, follower.place) == ([], known)
+        takes.set()
+        assert follower.push(found)
+        assert (sent, follower.place) == ([found.event], news)
+
+    asyncio.run(story())
+
+
+def test_a_follower_that_does_not_read_loses_nothing_and_holds_up_nobody(
+    served: Panelwright, client: httpx2.Client
+) -> None:
+    plant, batches, rows = served.service.plant, 60, 4  # twelve megabytes: more than the buffers of a connection hold
+    address = (served.url.split("//")[1].split(":")[0], int(served.url.rsplit(":", 1)[1]))
+    with socket.create_connection(address, timeout=60.0) as slow, slow.makefile("rb") as lines:
+        slow.sendall(b"GET /v1/feed/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        while not lines.readline().startswith(b"data: "):
+            pass
+        with client.stream("GET", "/v1/feed/events") as answer:
+            told = (json.loads(line[6:]) for line in answer.iter_lines() if line.startswith("data: "))
+            next(told)
+            for batch in range(batches):
+                plant.history.add([reading(k, float(rows * batch + k), cause="c" * 50_000) for k in range(rows)])
+                plant.observations.listeners[0]([])
+                assert [one["value"] for one in next(told)["readings"]][-1] == float(rows * batch + rows - 1)
+        values = list[float]()
+        while len(values) < rows * batches:
+            line = lines.readline()
+            if line.startswith(b"data: "):
+                values += [one["value"] for one in json.loads(line[6:])["readings"]]
+    assert values == [float(k) for k in range(rows * batches)]

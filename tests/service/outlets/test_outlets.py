@@ -26,7 +26,7 @@ from hal.strict import validate
 from service.access.keys import Role
 from service.client import ApiError
 from service.commissioning.outlets import checked_outlets
-from service.outlets.api import ApiSource
+from service.outlets.api import GATHER_S, ApiSource
 from service.outlets.process import outlets_of, run
 from service.outlets.prometheus import PrometheusOutlet
 from service.outlets.source import Cursor, CursorFile
@@ -272,6 +272,26 @@ def test_outlets_that_know_equally_much_share_one_request_that_outlives_any_of_t
 
     asyncio.run(story())
     assert sorted(asked) == ["6", "7", "7"]
+
+
+def test_requests_for_changes_leave_a_busy_service_time_to_gather_them() -> None:
+    asked_s: list[float] = []
+
+    async def answer(_request: httpx2.Request) -> httpx2.Response:
+        asked_s.append(asyncio.get_running_loop().time())
+        after = {"readings_after": len(asked_s), "alarms_after": 0}
+        return httpx2.Response(200, json={"readings": [], "alarms": [], **after})
+
+    async def story() -> None:
+        source = ApiSource("http://127.0.0.1:9", transport=httpx2.MockTransport(answer))
+        first = await source.changes(Cursor(reading=0, alarm=0), wait_s=5.0)
+        shared = await asyncio.gather(*(source.changes(first.cursor, wait_s=5.0) for _ in range(3)))
+        assert [one.cursor for one in shared] == [Cursor(reading=2, alarm=0)] * 3
+        await source.close()
+
+    asyncio.run(story())
+    first_s, second_s = asked_s
+    assert second_s - first_s >= GATHER_S
 
 
 def test_an_outlet_knows_the_panel_and_acknowledges_and_comments_as_the_service_allows(served: Panelwright) -> None:

@@ -11,6 +11,7 @@ import functools
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -191,12 +192,13 @@ class FeedDesk:
         self._awaited = follower.place
         self._followers.add(follower)
         try:
-            async with asyncio.timeout(ALIVE_S):
-                await follower.is_stirred.wait()
-        except TimeoutError:
-            await follower.send(_part(ALIVE))
+            with suppress(TimeoutError):
+                async with asyncio.timeout(ALIVE_S):
+                    await follower.is_stirred.wait()
         finally:
             self._followers.discard(follower)
+        if not follower.is_stirred.is_set():
+            await follower.send(_part(ALIVE))
 
     async def _look(self, place: Place) -> Found:
         """Return what has come after a place; those that know equally much share one look until something changes."""

@@ -23,6 +23,7 @@ DAY_S = 86_400.0
 TRIM_EVERY_S = 3600.0  # between two looks at the age of the oldest reading
 TRIM_EVERY_ADDS = 1000  # between two looks at the size
 TRIM_SHARE = 0.1  # of the readings leave at once when the file is too large
+KEPT_NEWEST = 200  # readings in memory, for those that follow
 ALL = ("id", "cell", "panel", *COLUMNS)
 ROW = f"({', '.join('?' * (2 + len(COLUMNS)))})"
 INSERT = f"INSERT INTO readings (cell, panel, {', '.join(COLUMNS)}) VALUES "
@@ -62,6 +63,7 @@ class History:
         self._lock = threading.Lock()
         self._adds, self._trimmed_s = 0, float("-inf")
         self.version = 0  # rises with all that is stored
+        self._newest: tuple[Row, ...] = ()  # the newest readings of this cell without a gap
         self._reader = Reader(self.path, self._parts)
         self._db, aside = open_history(self.path)
         self.set_aside_now = aside
@@ -93,12 +95,14 @@ class History:
         rows = [(self._cell, self._panel, *(getattr(reading, name) for name in COLUMNS)) for reading in readings]
         with self._lock:
             try:
-                self._insert(rows)
+                last_id = self._insert(rows)
             except sqlite3.Error as error:
                 if not is_damaged(error):
                     raise cannot_write(self.path, error) from error
                 self._begin_anew()
-                self._retry(rows)
+                last_id = self._retry(rows)
+            added = tuple(Row(id=last_id - len(rows) + k, reading=one) for k, one in enumerate(readings, start=1))
+            self._newest = (*self._newest, *added)[-KEPT_NEWEST:]
             self.version += 1
         self._trim_if_due()
 
@@ -121,6 +125,7 @@ class History:
                     "WHERE id = ? AND cell = ? AND doubt != '' AND answered IS NULL",
                     (said, value, state, text, reading_id, self._cell),
                 ).rowcount
+                self._newest = ()
                 self.version += 1
             except sqlite3.Error as error:
                 raise cannot_write(self.path, error) from error
@@ -143,6 +148,19 @@ class History:
         if not found or found[0].id != reading_id:
             raise NoSuchTask(f"there is no reading {reading_id} of this cell", hint="GET /v1/review lists what waits")
         return found[0]
+
+    def after(self, reading_id: int, *, limit: int) -> list[Row]:
+        """Return at most `limit` readings of this cell with a larger id, oldest first.
+
+        The newest ones come from memory: a question to the file waits for the lock of Python several times.
+
+        Raises:
+            HistoryError, Unsupported: as for `Reader.page`.
+        """
+        newest = self._newest
+        if newest and reading_id >= newest[0].id - 1:
+            return [row for row in newest if row.id > reading_id][:limit]
+        return self._reader.page(self.ask(), after=reading_id, limit=limit)
 
     def newest(self) -> list[StoredReading]:
         """Return the newest reading of each object of this cell."""
@@ -184,10 +202,14 @@ class History:
         except CellError as error:  # the reading itself is stored
             log.error("the history is larger than it should be: %s", error.what)
 
-    def _insert(self, rows: Sequence[tuple[object, ...]]) -> None:
-        # One statement for all rows, which is a transaction of its own: each further call of SQLite may wait for the
-        # lock of Python.
-        self._db.execute(INSERT + ", ".join([ROW] * len(rows)), [value for row in rows for value in row])
+    def _insert(self, rows: Sequence[tuple[object, ...]]) -> int:
+        """Return the id of the last row.
+
+        One statement for all rows, which is a transaction of its own: each further call of SQLite may wait for the lock of
+        Python.
+        """
+        done = self._db.execute(INSERT + ", ".join([ROW] * len(rows)), [value for row in rows for value in row])
+        return int(done.lastrowid or 0)
 
     def _begin_anew(self) -> None:
         """Set the damaged file aside and begin a new one."""
@@ -196,12 +218,13 @@ class History:
             self._db.close()
         self._db, aside = open_history(self.path)
         self.set_aside_now = aside or self.set_aside_now
+        self._newest = ()
         self._join_parts()
         log.error("the history was damaged while it was used: it is kept as %s", aside)
 
-    def _retry(self, rows: Sequence[tuple[object, ...]]) -> None:
+    def _retry(self, rows: Sequence[tuple[object, ...]]) -> int:
         try:
-            self._insert(rows)
+            return self._insert(rows)
         except sqlite3.Error as error:
             raise cannot_write(self.path, error) from error
 

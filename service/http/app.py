@@ -40,6 +40,7 @@ from service.http import (
     verbs,
 )
 from service.http.access import check_access
+from service.http.feed_desk import FeedDesk
 from service.http.guard import Allowed, RequestGuard
 from service.http.health import SAFETY_NOTE, own_version
 from service.http.hub import Hub
@@ -110,7 +111,7 @@ def create_app(
     )
     app.state.panelwright = state
     app.state.sampler = stream.Sampler(state)
-    app.state.feed = feed.FeedDesk()
+    app.state.feed = FeedDesk()
     routers = _routers(service)
     for router in routers:
         app.include_router(router)

@@ -210,7 +210,9 @@ def _question(state: AppState, name: str | None, since_s: float | None, until_s:
 
 def reading_view(row: Row) -> HistoryReading:
     """Return a stored reading as the API shows it."""
-    plain = {name: getattr(row.reading, name) for name in COLUMNS}  # `asdict` copies each, which takes ten times as long
+    plain = {
+        name: getattr(row.reading, name) for name in COLUMNS
+    }  # `asdict` copies each, which takes ten times as long
     crop = plain.pop("crop")
     url = None if crop is None else f"/v1/history/{row.reading.object}/crops/{crop}"
     said = plain.pop("certificate")

@@ -7,10 +7,13 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from hal.errors import Unsupported
 from hal.plant import HistorySection
@@ -23,11 +26,11 @@ from service.history.store import DAY_S, History
 NOW_S = 1_790_000_000.0
 
 
-def reading(k: int, value: float | None = 1.0, **given: Any) -> StoredReading:
-    is_valid = value is not None or "state" in given
+def reading(k: int, value: float | None = 1.0, **other: Any) -> StoredReading:
+    is_valid = value is not None or "state" in other
     plain = {"object": "pressure", "kind": "gauge", "utc_s": NOW_S + k, "cell_s": float(k), "unit": "bar"}
     plain |= {"quality": VALID if is_valid else INVALID, "cause": "" if is_valid else "glare", "value": value}
-    return StoredReading(**{**plain, **given})
+    return StoredReading(**{**plain, **other})
 
 
 def history_in(folder: Path, **bounds: Any) -> History:
@@ -52,6 +55,30 @@ def test_readings_come_back_as_they_were_stored_page_by_page(tmp_path: Path) -> 
     other = History(tmp_path, cell="other", panel="bench")
     assert other.reader().page(other.ask(object="pressure")) == []
     assert [row.reading.object for row in other.reader().newest("bench")] == ["pressure"]
+
+
+@given(
+    sizes=st.lists(st.integers(0, 150), min_size=1, max_size=6),
+    after=st.integers(0, 700),
+    limit=st.integers(1, 300),
+    answers=st.booleans(),
+)
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_the_newest_readings_are_those_of_the_file(
+    tmp_path: Path, sizes: list[int], after: int, limit: int, answers: bool
+) -> None:
+    with tempfile.TemporaryDirectory(dir=tmp_path) as folder:
+        mine, other = (History(Path(folder), cell=cell, panel="panel") for cell in ("mine", "other"))
+        for size in sizes:
+            mine.add([reading(k, float(k), doubt="which?") for k in range(size)])
+            other.add([reading(k, 0.0) for k in range(size % 3)])
+            if answers and size:
+                first = mine.after(0, limit=1)[0]
+                if first.reading.answered is None:
+                    mine.answer(first.id, said="{}", value=1.5, state=None, text=None)
+            assert mine.after(after, limit=limit) == mine.reader().page(mine.ask(), after=after, limit=limit)
+        mine.close()
+        other.close()
 
 
 def test_a_trend_counts_refusals_and_leaves_them_out_of_the_values(tmp_path: Path) -> None:
@@ -192,6 +219,7 @@ def test_a_history_that_cannot_be_written_says_so_and_recovers(tmp_path: Path) -
 def test_no_stored_reading_is_lost_by_kill_9(tmp_path: Path) -> None:
     code = f"""
 import sys
+import tempfile
 from pathlib import Path
 from tests.service.history.test_store import history_in, reading
 history = history_in(Path({str(tmp_path)!r}))

@@ -340,7 +340,7 @@ def test_a_stream_ends_with_the_key_that_began_it(
     http: httpx2.Client, guarded: Guarded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     book, commit = guarded.server.service.keys, guarded.server.service.commit
-    monkeypatch.setattr("service.http.feed.ALIVE_S", 0.05)
+    monkeypatch.setattr("service.http.feed_desk.ALIVE_S", 0.05)
     secret = book.add("guest", Role.OBSERVER, valid_s=None, commit=commit)
     url, mine = f"{guarded.server.url.replace('http', 'ws')}/v1/stream", {"Authorization": f"Bearer {secret}"}
     with (

@@ -13,8 +13,8 @@ import httpx2
 import pytest
 from starlette.types import Message
 
-from service.http import feed as feed_module
-from service.http.feed import Follower, Found, Place
+from service.http import feed_desk
+from service.http.feed_desk import Follower, Found, Place
 from service.plant import Plant
 from service.serve import Panelwright
 from tests.service.history.test_store import reading
@@ -44,7 +44,7 @@ def test_those_who_wait_for_the_feed_share_one_look_and_hold_up_no_read(
     served: Panelwright, client: httpx2.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plant, looks, waiting = served.service.plant, list[Place](), 60
-    look, has_looked = feed_module._found, threading.Event()
+    look, has_looked = feed_desk._found, threading.Event()
 
     def counted(of: Plant, place: Place) -> Found:
         looks.append(place)
@@ -52,7 +52,7 @@ def test_those_who_wait_for_the_feed_share_one_look_and_hold_up_no_read(
             has_looked.set()
         return look(of, place)
 
-    monkeypatch.setattr(feed_module, "_found", counted)
+    monkeypatch.setattr(feed_desk, "_found", counted)
     start = client.get("/v1/feed").json()
     asked = f"/v1/feed?readings_after={start['readings_after']}&alarms_after={start['alarms_after']}&wait_s=30"
     known = Place(start["readings_after"], start["alarms_after"])

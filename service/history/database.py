@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 import time
+from contextlib import closing
 from pathlib import Path
 
 from service.errors import HistoryError
 
 VERSION = 2
 MAGIC = b"SQLite format 3\0"
+MOST_LOG_PAGES = 10_000  # 40 MB: then the call that stores a reading moves the log itself
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS readings (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -35,6 +38,7 @@ FROM_VERSION_1 = (
     "final_state TEXT",
     "final_text TEXT",
 )
+log = logging.getLogger(__name__)
 
 
 def open_history(path: Path) -> tuple[sqlite3.Connection, Path | None]:
@@ -76,6 +80,18 @@ def cannot_write(path: Path, error: Exception) -> HistoryError:
     )
 
 
+def checkpoint(path: Path) -> None:
+    """Move what was stored from the write-ahead log into the database, beside those that read and write.
+
+    What comes meanwhile stays in the log until the next time.
+    """
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, isolation_level=None)) as db:
+            db.execute("PRAGMA wal_checkpoint(PASSIVE)")
+    except sqlite3.Error as error:  # the readings are in the log
+        log.warning("the log of the history %s stays as long as it is: %s", path, error)
+
+
 def set_aside_beside(path: Path) -> list[Path]:
     """Return the damaged files that were set aside, oldest first."""
     return sorted(path.parent.glob(f"{path.stem}-damaged-*{path.suffix}"))
@@ -91,6 +107,7 @@ def _opened(path: Path) -> sqlite3.Connection:
         db.execute("PRAGMA journal_mode=WAL")
         db.execute("PRAGMA synchronous=FULL")  # NORMAL may lose the newest readings in a power failure
         db.execute("PRAGMA journal_size_limit=4000000")
+        db.execute(f"PRAGMA wal_autocheckpoint={MOST_LOG_PAGES}")
         known = {row[1] for row in db.execute("PRAGMA table_info(readings)")}
         for column in FROM_VERSION_1:
             if known and column.partition(" ")[0] not in known:

@@ -7,6 +7,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from hal.errors import CellError
 from hal.plant import HistorySection
 from service.errors import NoSuchTask, NotPossibleNow
 from service.history.crops import Crops
-from service.history.database import cannot_write, is_damaged, open_history, set_aside_beside
+from service.history.database import cannot_write, checkpoint, is_damaged, open_history, set_aside_beside
 from service.history.parts import ids_of, need_engine, part_path, parts_of, write_parquet
 from service.history.query import Query, Reader, Row
 from service.history.reading import COLUMNS, StoredReading
@@ -23,6 +24,7 @@ DAY_S = 86_400.0
 TRIM_EVERY_S = 3600.0  # between two looks at the age of the oldest reading
 TRIM_EVERY_ADDS = 1000  # between two looks at the size
 TRIM_SHARE = 0.1  # of the readings leave at once when the file is too large
+CHECKPOINT_EVERY_ADDS = 100  # in a thread of its own: the call that stores a reading would take 20 to 50 ms
 KEPT_NEWEST = 200  # readings in memory, for those that follow
 ALL = ("id", "cell", "panel", *COLUMNS)
 ROW = f"({', '.join('?' * (2 + len(COLUMNS)))})"
@@ -65,6 +67,7 @@ class History:
         self.version = 0  # rises with all that is stored
         self._newest: tuple[Row, ...] = ()  # the newest readings of this cell without a gap
         self._reader = Reader(self.path, self._parts)
+        self._thread = ThreadPoolExecutor(1, "history-checkpoint")
         self._db, aside = open_history(self.path)
         self.set_aside_now = aside
         if aside is not None:
@@ -104,6 +107,9 @@ class History:
             added = tuple(Row(id=last_id - len(rows) + k, reading=one) for k, one in enumerate(readings, start=1))
             self._newest = (*self._newest, *added)[-KEPT_NEWEST:]
             self.version += 1
+            self._adds += 1
+            if self._adds % CHECKPOINT_EVERY_ADDS == 0:
+                self._thread.submit(checkpoint, self.path)
         self._trim_if_due()
 
     def answer(self, reading_id: int, *, said: str, value: float | None, state: str | None, text: str | None) -> Row:
@@ -175,6 +181,7 @@ class History:
         with self._lock:
             self._reader.close()
             self._db.close()
+        self._thread.shutdown()
 
     def trim(self) -> None:
         """Move or delete the readings that are too old or too many.
@@ -194,7 +201,6 @@ class History:
                 raise cannot_write(self.path, error) from error
 
     def _trim_if_due(self) -> None:
-        self._adds += 1
         if self._adds < TRIM_EVERY_ADDS and self._now_s() - self._trimmed_s < TRIM_EVERY_S:
             return
         try:

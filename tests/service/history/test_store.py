@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from service.errors import HistoryError
 from service.history.crops import Crops
 from service.history.parts import read_parts
 from service.history.reading import INVALID, VALID, StoredReading
-from service.history.store import DAY_S, History
+from service.history.store import CHECKPOINT_EVERY_ADDS, DAY_S, History
 
 NOW_S = 1_790_000_000.0
 
@@ -216,10 +217,23 @@ def test_a_history_that_cannot_be_written_says_so_and_recovers(tmp_path: Path) -
     assert [row.reading.utc_s - NOW_S for row in history.reader().page(history.ask())] == [0.0, 2.0]
 
 
+def test_the_log_is_moved_into_the_database_while_readings_are_stored(tmp_path: Path) -> None:
+    history = history_in(tmp_path)
+    for k in range(2 * CHECKPOINT_EVERY_ADDS):
+        history.add([reading(k)])
+    history._thread.submit(lambda: None).result()  # the checkpoints before it are done
+    alone = shutil.copy(history.path, tmp_path / "without-log.sqlite")
+    with closing(sqlite3.connect(alone)) as db:
+        moved = db.execute("SELECT COUNT(*) FROM readings").fetchone()[0]
+    assert moved >= CHECKPOINT_EVERY_ADDS
+    history.close()
+
+
 def test_no_stored_reading_is_lost_by_kill_9(tmp_path: Path) -> None:
     code = f"""
 import sys
 import tempfile
+from contextlib import closing
 from pathlib import Path
 from tests.service.history.test_store import history_in, reading
 history = history_in(Path({str(tmp_path)!r}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hal.errors import Cancelled, InvalidRequest
+from hal.errors import InvalidRequest
 from service.tasks.model import Artefact, Task
 
 MAX_ARTEFACT_BYTES = 64_000_000
@@ -41,11 +41,7 @@ class TaskContext:
     def check_cancelled(self) -> None:
         """Raise `Cancelled` when cancellation of this task was requested."""
         if self.is_cancelled:
-            raise Cancelled(
-                f"task {self._task.id} was cancelled: {self._task.cancel_reason}",
-                hint="start it again when ready",
-                task=self._task.id,
-            )
+            raise self._task.cancellation()
 
     def pause_point(self, hold: Callable[[], object]) -> None:
         """Stand still between two steps for as long as somebody wants a pause; `hold` is called again and again meanwhile.

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Literal
 
-from service.problem import ProblemFields
+from hal.errors import Cancelled
+from service.problem import ProblemFields, problem_of
 from service.tasks.sub_leases import SubLease
 
 MAX_EVENTS = 2000  # a task that reports more than this drops its oldest events; their sequence numbers show the gap
@@ -144,6 +145,8 @@ class Task:
         with self._condition:
             if state not in ALLOWED[self.state]:
                 return False
+            if self.state is TaskState.QUEUED and state is TaskState.CANCELLED:
+                self.problem = problem_of(self.cancellation())  # no work begins that could tell why
             self.state = state
             if state is TaskState.RUNNING:
                 self.started_s = time.time()
@@ -169,6 +172,12 @@ class Task:
             return True
         self.move_to(TaskState.CANCELLING)
         return True
+
+    def cancellation(self) -> Cancelled:
+        """Return the error that ends the work after `ask_cancel`."""
+        return Cancelled(
+            f"task {self.id} was cancelled: {self.cancel_reason}", hint="start it again when ready", task=self.id
+        )
 
     def add_event(self, kind: str, *, fraction: float | None = None, step: str | None = None, detail: str = "") -> None:
         """Append an event; a fraction or step that is not given stays unchanged."""

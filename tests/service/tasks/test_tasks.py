@@ -142,8 +142,9 @@ def test_cancelling_a_queued_task_ends_it_without_touching_the_arm(bench: Bench)
     eventually(lambda: first.state is S.RUNNING)
     ran: list[int] = []
     second = bench.store.start("test", {}, lambda _: ran.append(1), moves=True)
-    bench.store.cancel(second.id)
+    bench.store.cancel(second.id, reason="bob took over")
     assert second.state is S.CANCELLED
+    assert second.problem is not None and "bob took over" in second.problem["detail"]
     assert bench.stops == 0
     bench.store.cancel(first.id)
     bench.run(lambda _: None, moves=True)

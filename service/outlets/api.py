@@ -16,9 +16,7 @@ from service.client import ApiError, trusting_only
 from service.outlets.source import CellState, Changes, Cursor, Deed, Instrument, instruments_of
 
 TIMEOUT_S = 10.0
-GATHER_S = (
-    0.1  # least time between requests for changes: a service that is busy answers one for many readings and outlets
-)
+GATHER_S = 0.1  # between requests for changes: a busy service answers one for many readings and outlets
 
 
 class ApiSource:

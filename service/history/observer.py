@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
+from hal.priorities import promptly
 from service.history.reading import StoredReading, answer_of
 from service.history.store import History
 
@@ -128,6 +129,17 @@ class Observations:
     def __post_init__(self) -> None:
         self.targets = self.history.told()
 
+    def keep(self, readings: Sequence[StoredReading]) -> None:
+        """Store readings, then let the listeners see them.
+
+        Raises:
+            HistoryError: they could not be stored.
+        """
+        with promptly():
+            self.history.add(readings)
+            for listen in self.listeners:
+                listen(readings)
+
     def of_task(self, *, task: str, verb: str, asked_by: str, cell_now_s: Callable[[], float]) -> TaskObserver:
         """Return the observer of one task."""
         return TaskObserver(self, task=task, verb=verb, asked_by=asked_by, cell_now_s=cell_now_s)
@@ -172,9 +184,7 @@ class TaskObserver:
             if one.doubt and one.crop is not None and (around := surroundings(one.object)) is not None:
                 self._kept.history.crops.add_surroundings(one.crop, around)
         stored = [replace(one, certificate=self._kept.certify(one, crops.get(one.object))) for one in stored]
-        self._kept.history.add(stored)
-        for listen in self._kept.listeners:
-            listen(stored)
+        self._kept.keep(stored)
 
     def told(self, name: str, target: str) -> None:
         """Note what an object is now told to be; its next reading says so."""

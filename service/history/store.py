@@ -24,7 +24,7 @@ DAY_S = 86_400.0
 TRIM_EVERY_S = 3600.0  # between two looks at the age of the oldest reading
 TRIM_EVERY_ADDS = 1000  # between two looks at the size
 TRIM_SHARE = 0.1  # of the readings leave at once when the file is too large
-CHECKPOINT_EVERY_ADDS = 100  # in a thread of its own: the call that stores a reading would take 20 to 50 ms
+CHECKPOINT_EVERY_ADDS = 100  # like trimming in a thread of its own: the call that stores a reading would take 20 to 50 ms
 KEPT_NEWEST = 200  # readings in memory, for those that follow
 ALL = ("id", "cell", "panel", *COLUMNS)
 ROW = f"({', '.join('?' * (2 + len(COLUMNS)))})"
@@ -67,7 +67,7 @@ class History:
         self.version = 0  # rises with all that is stored
         self._newest: tuple[Row, ...] = ()  # the newest readings of this cell without a gap
         self._reader = Reader(self.path, self._parts)
-        self._thread = ThreadPoolExecutor(1, "history-checkpoint")
+        self._thread = ThreadPoolExecutor(1, "history-upkeep")
         self._db, aside = open_history(self.path)
         self.set_aside_now = aside
         if aside is not None:
@@ -110,7 +110,9 @@ class History:
             self._adds += 1
             if self._adds % CHECKPOINT_EVERY_ADDS == 0:
                 self._thread.submit(checkpoint, self.path)
-        self._trim_if_due()
+            if self._adds >= TRIM_EVERY_ADDS or self._now_s() - self._trimmed_s >= TRIM_EVERY_S:
+                self._adds, self._trimmed_s = 0, self._now_s()
+                self._thread.submit(self._trim_or_say)
 
     def answer(self, reading_id: int, *, said: str, value: float | None, state: str | None, text: str | None) -> Row:
         """Store what a person says about a reading, beside what was read; returns the reading as it is now.
@@ -178,10 +180,10 @@ class History:
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
+        self._thread.shutdown(cancel_futures=True)
         with self._lock:
             self._reader.close()
             self._db.close()
-        self._thread.shutdown()
 
     def trim(self) -> None:
         """Move or delete the readings that are too old or too many.
@@ -189,7 +191,6 @@ class History:
         Raises:
             HistoryError, Unsupported: that failed; no reading is lost.
         """
-        self._adds, self._trimmed_s = 0, self._now_s()
         with self._lock:
             try:
                 self._move_until(self._last_too_old())
@@ -200,9 +201,7 @@ class History:
                     self._db.execute("ROLLBACK")
                 raise cannot_write(self.path, error) from error
 
-    def _trim_if_due(self) -> None:
-        if self._adds < TRIM_EVERY_ADDS and self._now_s() - self._trimmed_s < TRIM_EVERY_S:
-            return
+    def _trim_or_say(self) -> None:
         try:
             self.trim()
         except CellError as error:  # the reading itself is stored

@@ -29,7 +29,16 @@ BENCH = ROOT / "cells/bench.toml"
 YEAR_H, OBJECTS, BUCKETS = 8760, 20, 200
 PROBE_S = 0.02  # between two probes
 FLOOR_PROBES = 200
-FOLLOWERS = """
+FIRST = """
+import os
+try:
+    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(50))
+except OSError:
+    pass
+"""  # what measures does not wait for turns
+FOLLOWERS = (
+    FIRST
+    + """
 import json, selectors, socket, sys, time
 address, path, count = (sys.argv[1], int(sys.argv[2])), sys.argv[3], int(sys.argv[4])
 asked = f"GET {path} HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\n\\r\\n".encode()
@@ -60,12 +69,11 @@ while True:
                 number = part.split(b'"value":', 1)[1].split(b",", 1)[0].decode()
                 seen.setdefault(number, []).append(now_s)
 """
-DISK = """
-import json, os, select, sys, time
-try:
-    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(50))
-except OSError:
-    pass
+)
+DISK = (
+    FIRST
+    + """
+import json, select, sys, time
 file, times = os.open(sys.argv[1], os.O_RDWR | os.O_CREAT), []
 os.write(file, bytes(4096 * 1000))
 os.fsync(file)
@@ -76,6 +84,7 @@ while not select.select([sys.stdin], [], [], float(sys.argv[2]))[0]:
     times.append(time.monotonic() - begun)
 print(json.dumps(times), flush=True)
 """
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

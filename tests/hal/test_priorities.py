@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hal.priorities import ATTRIBUTES, CALLS, SESSION, SESSION_NICENESS, Priority, take_priority
+from hal.priorities import ATTRIBUTES, CALLS, SESSION, SESSION_NICENESS, Priority, promptly, take_priority
 
 pytestmark = pytest.mark.skipif(platform.machine() not in CALLS, reason="the system call is not known here")
 
@@ -75,6 +75,27 @@ def test_stop_and_answers_are_real_time_where_that_is_allowed_and_else_keep_thei
     may_be_first = os.geteuid() == 0
     assert niceness == (plain[0] - 10 if priority is Priority.STOP and may_be_first else plain[0])
     assert turn_s == (pytest.approx(0.0001) if priority is Priority.STOP and plain[1] else plain[1])
+
+
+@pytest.mark.parametrize("is_allowed", [True, False])
+def test_a_thread_comes_first_for_a_moment_where_that_is_allowed(
+    is_allowed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policies = [os.SCHED_OTHER]
+
+    def schedule(_pid: int, policy: int, _param: os.sched_param) -> None:
+        if not is_allowed:
+            raise PermissionError(1, "Operation not permitted")
+        policies.append(policy)
+
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _pid: policies[-1])
+    with pytest.raises(ValueError, match="of the caller"), promptly(), promptly():
+        raise ValueError("of the caller")
+    with promptly():
+        pass
+    first, later = os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
+    assert policies == [os.SCHED_OTHER, *([first, later, first, later] if is_allowed else [])]
 
 
 def test_a_process_raises_the_session_that_it_leads_and_no_other() -> None:

@@ -20,6 +20,7 @@ from hal.errors import Unsupported
 from hal.plant import HistorySection
 from service.errors import HistoryError
 from service.history.crops import Crops
+from service.history.database import LOG_BYTES
 from service.history.parts import read_parts
 from service.history.reading import INVALID, VALID, StoredReading
 from service.history.store import CHECKPOINT_EVERY_ADDS, DAY_S, History
@@ -227,6 +228,21 @@ def test_the_log_is_moved_into_the_database_while_readings_are_stored(tmp_path: 
         moved = db.execute("SELECT COUNT(*) FROM readings").fetchone()[0]
     assert moved >= CHECKPOINT_EVERY_ADDS
     history.close()
+
+
+def test_the_log_has_its_space_before_the_first_reading_and_keeps_it(tmp_path: Path) -> None:
+    sizes, history = [], history_in(tmp_path)
+    log = history.path.with_name(f"{history.path.name}-wal")
+    for k in range(2 * CHECKPOINT_EVERY_ADDS):
+        sizes.append(log.stat().st_size)
+        history.add([reading(k)])
+        if k % CHECKPOINT_EVERY_ADDS == CHECKPOINT_EVERY_ADDS - 1:
+            history._thread.submit(lambda: None).result()  # the checkpoint before it is done
+    assert set(sizes) == {LOG_BYTES}
+    history.close()
+    again = history_in(tmp_path)
+    assert len(again.reader().page(again.ask())) == len(sizes)
+    again.close()
 
 
 def test_no_stored_reading_is_lost_by_kill_9(tmp_path: Path) -> None:

@@ -104,6 +104,21 @@ def test_what_fails_is_tried_again_in_order_with_the_same_number(tmp_path: Path)
     assert [request.headers["x-panelwright-id"][-1] for request in receiver.got] == ["1", "1", "1", "1", "2"]
 
 
+def test_a_place_is_overwritten_and_an_earlier_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "mqtt.json"
+    kept = CursorFile(path)
+    assert kept.load() == Cursor()
+    kept.save(Cursor(reading=10**18, alarm=10**18))
+    number = path.stat().st_ino
+    kept.save(Cursor(reading=7, alarm=None))
+    assert CursorFile(path).load() == Cursor(reading=7, alarm=None)
+    assert path.stat().st_ino == number
+    path.write_text('{"reading": 12345, "alarm": 67}')
+    assert kept.load() == Cursor(reading=12345, alarm=67)
+    kept.save(Cursor(reading=1, alarm=2))
+    assert kept.load() == Cursor(reading=1, alarm=2)
+
+
 @pytest.mark.parametrize(("statuses", "tries", "why"), [((503,) * 3, 3, "status 503"), ((400,), 1, "status 400")])
 def test_what_cannot_be_delivered_is_kept_and_holds_up_nothing(
     tmp_path: Path, statuses: tuple[int, ...], tries: int, why: str

@@ -75,10 +75,10 @@ DISK = (
     + """
 import json, select, sys, time
 file, times = os.open(sys.argv[1], os.O_RDWR | os.O_CREAT), []
-os.write(file, bytes(4096 * 1000))
+os.write(file, bytes(4096 * 100))
 os.fsync(file)
 while not select.select([sys.stdin], [], [], float(sys.argv[2]))[0]:
-    os.pwrite(file, os.urandom(4096), 4096 * (len(times) % 1000))
+    os.pwrite(file, os.urandom(4096), 4096 * (len(times) % 100))
     begun = time.monotonic()
     os.fdatasync(file)
     times.append(time.monotonic() - begun)

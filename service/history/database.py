@@ -13,7 +13,7 @@ from service.errors import HistoryError
 
 VERSION = 2
 MAGIC = b"SQLite format 3\0"
-LOG_BYTES = 4_000_000  # of the write-ahead log on disk, which holds some 200 readings
+LOG_BYTES = 2_000_000  # of the write-ahead log on disk, which holds some 100 readings
 MOST_LOG_PAGES = 10_000  # 40 MB: then the call that stores a reading moves the log itself
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS readings (

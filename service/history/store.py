@@ -24,9 +24,7 @@ DAY_S = 86_400.0
 TRIM_EVERY_S = 3600.0  # between two looks at the age of the oldest reading
 TRIM_EVERY_ADDS = 1000  # between two looks at the size
 TRIM_SHARE = 0.1  # of the readings leave at once when the file is too large
-CHECKPOINT_EVERY_ADDS = (
-    100  # like trimming in a thread of its own: the call that stores a reading would take 20 to 50 ms
-)
+CHECKPOINT_EVERY_ADDS = 50  # in a thread of its own, as trimming: the call that stores would take 20 to 50 ms
 KEPT_NEWEST = 200  # readings in memory, for those that follow
 ALL = ("id", "cell", "panel", *COLUMNS)
 ROW = f"({', '.join('?' * (2 + len(COLUMNS)))})"

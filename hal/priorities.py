@@ -25,7 +25,7 @@ from pathlib import Path
 ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 PROMPT = 1  # real-time priority, as that of the event loop
 SESSION = Path("/proc/self/autogroup")
-SESSION_NICENESS = -20
+SESSION_NICENESS = -15
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}  # numbers of the system call sched_setattr
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ def raise_session() -> None:
 
     Threads of one Python process wait for the one that computes, also those with a real-time priority. Beside ten browsers on the
     same two cores, 30 of 1000 timers of the event loop were more than 10 ms late during a mission, 14 with a niceness of -10, and
-    8 with -20.
+    8 with -20. That is the niceness of the workers that complete writes to a disk, which then wait up to 4 ms for their turn.
     """
     if os.getsid(0) != os.getpid():
         return  # the session of a person's shell, in which much else may run

@@ -10,7 +10,8 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Send
 
 from service.http.access import StillMay
-from service.http.feed_desk import Feed, FeedDesk, Follower, Found, Place, part_of_answer
+from service.http.feed_desk import Feed, FeedDesk, Follower, Found, Place, Push, part_of_answer
+from service.http.load import PUSH
 from service.http.problems import RESPONSES
 
 router = APIRouter(prefix="/v1/feed", tags=["history"], responses=RESPONSES)
@@ -55,6 +56,7 @@ async def follow_feed(
     responses={200: {"content": {"text/event-stream": {}}}},
 )
 async def stream_feed(
+    request: Request,
     desk: Desk,
     may: StillMay,
     readings_after: After = None,
@@ -68,19 +70,19 @@ async def stream_feed(
         reading, _, alarm = last_event_id.partition("-")
         begin = Place(int(reading), int(alarm))
     first = await desk.ask(begin, wait_s=0.0)  # an error is an answer, not an empty stream
-    return _FollowerStream(desk, first, may)
+    return _FollowerStream(desk, first, may, push=request.scope.get("extensions", {}).get(PUSH, {}).get("push"))
 
 
 class _FollowerStream(StreamingResponse):
     """Sends what was found and all that comes later; the first event also tells where the stream begins."""
 
-    def __init__(self, desk: FeedDesk, first: Found, may: Callable[[], bool]) -> None:
+    def __init__(self, desk: FeedDesk, first: Found, may: Callable[[], bool], *, push: Push | None) -> None:
         super().__init__((), media_type="text/event-stream")
-        self._desk, self._first, self._may = desk, first, may
+        self._desk, self._first, self._may, self._push = desk, first, may, push
 
     async def stream_response(self, send: Send) -> None:
         """Send the answer; cancelled when the client leaves."""
         await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
         await send(part_of_answer(self._first.event))
-        await self._desk.follow(Follower(send=send, may=self._may, place=self._first.next))
+        await self._desk.follow(Follower(send=send, push=self._push, may=self._may, place=self._first.next))
         await send({"type": "http.response.body", "body": b"", "more_body": False})

@@ -26,6 +26,7 @@ BATCH = 200
 KEPT_LOOKS = 64  # answers that are kept until the next change, for all that know equally much
 ALIVE_S = 15.0  # a stream sends an empty line so often, so that both sides notice a broken connection
 ALIVE = b":\n\n"
+Push = Callable[[bytes], bool]
 log = logging.getLogger(__name__)
 
 
@@ -70,6 +71,7 @@ class Found:
     Attributes:
         body: a `Feed` as JSON.
         event: the same as a server-sent event.
+        chunk: that event as a chunk of an HTTP/1.1 answer (RFC 9112, 7.1).
         next: where it ends.
         is_news: whether there is anything in it.
     """
@@ -78,6 +80,10 @@ class Found:
     event: bytes
     next: Place
     is_news: bool
+    chunk: bytes = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "chunk", b"%x\r\n%b\r\n" % (len(self.event), self.event))
 
 
 @dataclass(eq=False, slots=True, kw_only=True)
@@ -86,11 +92,13 @@ class Follower:
 
     Attributes:
         send: of its connection, as in ASGI.
+        push: writes a chunk at once, or returns False; see `LimitedProtocol.push`. None: it is told by `send` only.
         may: whether its key is valid still.
         is_stirred: set when it must look itself.
     """
 
     send: Send
+    push: Push | None
     may: Callable[[], bool]
     place: Place
     is_stirred: asyncio.Event = field(default_factory=asyncio.Event)
@@ -99,20 +107,6 @@ class Follower:
         """Send what was found, and wait while the connection is full."""
         await self.send(part_of_answer(found.event if found.is_news else ALIVE))
         self.place = found.next
-
-    def push(self, found: Found) -> bool:
-        """Send what was found at once; False where the connection is full, and nothing was sent.
-
-        A server waits before it writes, so that a send which would wait can be given up.
-        """
-        sending = self.send(part_of_answer(found.event)).__await__()
-        try:
-            next(sending)
-        except StopIteration:
-            self.place = found.next
-            return True
-        sending.close()
-        return False
 
 
 class FeedDesk:
@@ -231,10 +225,13 @@ class FeedDesk:
         if not found.is_news:
             return found.next == follower.place
         try:
-            return follower.may() and follower.push(found)
-        except Exception:  # the same comes up where the follower sends itself
+            if follower.push is None or not follower.may() or not follower.push(found.chunk):
+                return False
+        except Exception:  # the same comes up where the follower looks itself
             log.debug("a follower cannot be told", exc_info=True)
             return False
+        follower.place = found.next
+        return True
 
     def _version(self) -> tuple[int, int]:
         return self._plant.history.version, self._plant.changes

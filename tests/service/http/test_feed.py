@@ -11,10 +11,9 @@ from typing import Any
 
 import httpx2
 import pytest
-from starlette.types import Message
 
 from service.http import feed_desk
-from service.http.feed_desk import Follower, Found, Place
+from service.http.feed_desk import Found, Place
 from service.plant import Plant
 from service.serve import Panelwright
 from tests.service.history.test_store import reading
@@ -103,28 +102,6 @@ def test_the_feed_streams_what_comes_and_goes_on_after_the_last_event(
     assert client.get("/v1/feed/events", headers={"Last-Event-ID": "yesterday"}).status_code == 422
 
 
-def test_a_follower_whose_connection_is_full_is_given_nothing_until_it_takes_again() -> None:
-    sent: list[bytes] = []
-    known, news = Place(3, 0), Place(4, 0)
-    found = Found(body=b"{}", event=b"id: 4-0\ndata: {}\n\n", next=news, is_news=True)
-
-    async def story() -> None:
-        takes = asyncio.Event()
-
-        async def send(message: Message) -> None:  # as uvicorn: it waits first, then it writes
-            await takes.wait()
-            sent.append(message["body"])
-
-        follower = Follower(send=send, may=lambda: True, place=known)
-        assert not follower.push(found)
-        assert (sent, follower.place) == ([], known)
-        takes.set()
-        assert follower.push(found)
-        assert (sent, follower.place) == ([found.event], news)
-
-    asyncio.run(story())
-
-
 def test_a_follower_that_does_not_read_loses_nothing_and_holds_up_nobody(
     served: Panelwright, client: httpx2.Client
 ) -> None:
@@ -147,3 +124,35 @@ def test_a_follower_that_does_not_read_loses_nothing_and_holds_up_nobody(
             if line.startswith(b"data: "):
                 values += [one["value"] for one in json.loads(line[6:])["readings"]]
     assert values == [float(k) for k in range(rows * batches)]
+
+
+def test_a_follower_of_an_old_http_is_told_without_chunks(served: Panelwright) -> None:
+    plant = served.service.plant
+    address = (served.url.split("//")[1].split(":")[0], int(served.url.rsplit(":", 1)[1]))
+    with socket.create_connection(address, timeout=60.0) as old, old.makefile("rb") as lines:
+        old.sendall(b"GET /v1/feed/events HTTP/1.0\r\nHost: 127.0.0.1\r\n\r\n")
+        while not lines.readline().startswith(b"data: "):
+            pass
+        assert lines.readline() == b"\n"
+        for value in (1.5, 2.5):
+            plant.observations.keep([reading(0, value)])
+            assert lines.readline().startswith(b"id: ")
+            assert [one["value"] for one in json.loads(lines.readline()[6:])["readings"]] == [value]
+            assert lines.readline() == b"\n"
+
+
+def test_each_chunk_of_a_stream_is_one_event(served: Panelwright) -> None:
+    plant = served.service.plant
+    address = (served.url.split("//")[1].split(":")[0], int(served.url.rsplit(":", 1)[1]))
+    with socket.create_connection(address, timeout=60.0) as follower, follower.makefile("rb") as lines:
+        follower.sendall(b"GET /v1/feed/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        while lines.readline() != b"\r\n":
+            pass
+        for value in (None, 1.5, 2.5):
+            if value is not None:
+                plant.observations.keep([reading(0, value)])
+            event = lines.read(int(lines.readline(), 16))
+            assert lines.readline() == b"\r\n"
+            assert event.startswith(b"id: ") and event.endswith(b"\n\n")
+            told = [one["value"] for one in json.loads(event.partition(b"data: ")[2])["readings"]]
+            assert told == ([] if value is None else [value])

@@ -25,7 +25,7 @@ from pathlib import Path
 ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 PROMPT = 1  # real-time priority, as that of the event loop
 SESSION = Path("/proc/self/autogroup")
-SESSION_NICENESS = -15
+SESSION_NICENESS = -12
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}  # numbers of the system call sched_setattr
 log = logging.getLogger(__name__)
 

@@ -94,7 +94,8 @@ def test_on_a_full_disk_the_motion_ends_nothing_is_acknowledged_and_the_stop_wor
 
 def test_a_deleted_folder_ends_the_permission_to_move_and_a_new_journal_says_so(served: Served) -> None:
     before = read_records(served.runs / ".service" / "journal.sqlite")[-1]
-    shutil.rmtree(served.runs)
+    deleted = served.runs.rename(served.runs.with_name("deleted"))  # in which the service makes no further file
+    shutil.rmtree(deleted)
     eventually(lambda: served.is_stopped_by("deleted"))
     eventually(lambda: served.get("/readyz")["journal_problem"] is None)
     assert served.reset().status_code == 200

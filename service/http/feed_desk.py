@@ -224,11 +224,7 @@ class FeedDesk:
         """Return whether a follower knows now what was found; False if it must look itself."""
         if not found.is_news:
             return found.next == follower.place
-        try:
-            if follower.push is None or not follower.may() or not follower.push(found.chunk):
-                return False
-        except Exception:  # the same comes up where the follower looks itself
-            log.debug("a follower cannot be told", exc_info=True)
+        if follower.push is None or not follower.may() or not follower.push(found.chunk):
             return False
         follower.place = found.next
         return True

@@ -18,7 +18,7 @@ from hal.errors import CellError
 from hal.priorities import Priority, take_priority
 from service.errors import Busy
 from service.http.guard import Allowed, RequestGuard
-from service.http.load import Load
+from service.http.load import LimitedProtocol, Load
 from service.serve import Panelwright
 from tests.service.verbs import HoldRequest
 from tests.service.waiting import eventually
@@ -209,3 +209,25 @@ def test_threads_that_compute_are_nicer_than_the_process(client: httpx2.Client) 
         threads = [thread.native_id for thread in threading.enumerate() if thread.name.startswith(name)]
         assert threads, name
         assert {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads if thread} == {nicer}
+
+
+def test_a_chunk_is_pushed_only_while_the_connection_has_room() -> None:
+    chunk = bytes(range(256)) * 256
+
+    async def story() -> None:
+        near, far = socket.socketpair()
+        with far:
+            loop = asyncio.get_running_loop()
+            protocol = LimitedProtocol.__new__(LimitedProtocol)
+            protocol.transport, _ = await loop.create_connection(asyncio.Protocol, sock=near)
+            pushed = 0
+            while protocol.push(chunk):
+                pushed += 1
+            assert not protocol.push(chunk), "a full connection was given more"
+            reading = asyncio.to_thread(far.recv, pushed * len(chunk), socket.MSG_WAITALL)
+            assert await reading == pushed * chunk
+            assert protocol.push(chunk)
+            protocol.transport.close()
+            assert not protocol.push(chunk)
+
+    asyncio.run(story())

@@ -11,7 +11,7 @@ from types import FrameType
 import uvicorn
 from starlette.types import ASGIApp
 
-from hal.priorities import Priority, take_priority
+from hal.priorities import Priority, RealtimeUnlessBusy, take_priority
 from service.http.load import Load, limited_protocol
 
 GRACE_S = 2
@@ -23,6 +23,14 @@ class _Server(uvicorn.Server):
     def __init__(self, config: uvicorn.Config, on_exit: Callable[[str], None]) -> None:
         super().__init__(config)
         self._on_exit = on_exit
+        self._realtime: RealtimeUnlessBusy | None = None
+
+    async def on_tick(self, counter: int) -> bool:
+        """Review the priority of the event loop; uvicorn calls this ten times a second."""
+        if self._realtime is None:
+            self._realtime = RealtimeUnlessBusy()
+        self._realtime.review()
+        return await super().on_tick(counter)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Handle the first SIGINT or SIGTERM; called by uvicorn, which would cut off all answers at a second one."""

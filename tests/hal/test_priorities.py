@@ -12,7 +12,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hal.priorities import ATTRIBUTES, CALLS, SESSION, SESSION_NICENESS, Priority, promptly, take_priority
+from hal.priorities import (
+    ATTRIBUTES,
+    CALLS,
+    SESSION,
+    SESSION_NICENESS,
+    Priority,
+    RealtimeUnlessBusy,
+    promptly,
+    take_priority,
+)
 
 pytestmark = pytest.mark.skipif(platform.machine() not in CALLS, reason="the system call is not known here")
 
@@ -96,6 +105,32 @@ def test_a_thread_comes_first_for_a_moment_where_that_is_allowed(
         pass
     first, later = os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
     assert policies == [os.SCHED_OTHER, *([first, later, first, later] if is_allowed else [])]
+
+
+@pytest.mark.parametrize(
+    ("begins_as", "busy_as"),
+    [(os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK), (os.SCHED_OTHER,) * 2],
+)
+def test_a_thread_without_a_pause_is_real_time_no_more_until_it_pauses(
+    begins_as: int, busy_as: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, clock_s, computed_s = begins_as, 0.0, 0.0
+
+    def schedule(_pid: int, asked: int, _param: os.sched_param) -> None:
+        nonlocal policy
+        policy = asked
+
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _pid: policy)
+    monkeypatch.setattr("time.monotonic", lambda: clock_s)
+    monkeypatch.setattr("time.thread_time", lambda: computed_s)
+    realtime = RealtimeUnlessBusy()
+    found: list[int] = []
+    for share in (0.5, 0.9, 0.95, 0.7, 0.1, 1.0):
+        clock_s, computed_s = clock_s + 0.1, computed_s + 0.1 * share
+        realtime.review()
+        found.append(policy)
+    assert found == [begins_as, busy_as, busy_as, begins_as, begins_as, busy_as]
 
 
 def test_a_process_raises_the_session_that_it_leads_and_no_other() -> None:

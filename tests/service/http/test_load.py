@@ -198,7 +198,7 @@ def test_the_event_loop_is_real_time_where_that_is_allowed() -> None:
     with ThreadPoolExecutor(1) as other:
         wanted = other.submit(lambda: take_priority(Priority.ANSWERS) or os.sched_getscheduler(0)).result()
     loops = [thread.native_id for thread in threading.enumerate() if thread.name == "http"]
-    assert {os.sched_getscheduler(loop) for loop in loops if loop} == {wanted}
+    eventually(lambda: {os.sched_getscheduler(loop) for loop in loops if loop} == {wanted})  # unless it is busy
 
 
 def test_threads_that_compute_are_nicer_than_the_process(client: httpx2.Client) -> None:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.config import load_cell
 from hal.gc_freeze import freeze_loaded
@@ -122,15 +123,28 @@ class _Notes:
         """Forget everything."""
         self.stamps_s, self.joint_rad = [], []
 
-    def braking_s(self) -> list[float]:
-        """Return the times of the last set-points, whose steps only shrink, and of those at rest behind them."""
-        steps = np.abs(np.diff(self.joint_rad))
-        first = len(steps) - 1
-        while first > 0 and steps[first] < LEAST_RAD:
-            first -= 1  # at rest
-        while first > 0 and steps[first] < SHRINKS * steps[first - 1]:
-            first -= 1  # braking; a late tick before the stop may look like it
-        return self.stamps_s[first + 2 :]
+
+def braking_stamps_s(stamps_s: Sequence[float], joint_rad: Sequence[float]) -> Sequence[float]:
+    """Return the times of the last set-points of a joint, whose steps only shrink, and of those at rest behind them."""
+    steps = np.abs(np.diff(joint_rad))
+    first = len(steps) - 1
+    while first > 0 and steps[first] < LEAST_RAD:
+        first -= 1  # at rest
+    while first > 0 and steps[first] < SHRINKS * steps[first - 1]:
+        first -= 1  # braking; a late tick before the stop may look like it
+    return stamps_s[first + 2 :]
+
+
+def long_motion(begin_rad: NDArray[np.float64]) -> JointTrajectory:
+    """Return a motion of the first joint that goes on until something ends it."""
+    end_rad = begin_rad.copy()
+    end_rad[0] += SPAN_RAD if begin_rad[0] < 0.0 else -SPAN_RAD
+    return JointTrajectory(
+        name="until the stop",
+        times_s=np.array([0.0, MOTION_S]),
+        positions_rad=np.array([begin_rad, end_rad]),
+        velocities_rad_per_s=np.zeros((2, 6)),
+    )
 
 
 def main() -> None:
@@ -174,22 +188,13 @@ def main() -> None:
 
 def _move(mover: Any, notes: _Notes, out: Any) -> None:
     """Move until the stop; tell when the motion runs, and when it began to brake."""
-    begin = mover.state().position_rad
-    end = begin.copy()
-    end[0] += SPAN_RAD if begin[0] < 0.0 else -SPAN_RAD
-    motion = JointTrajectory(
-        name="until the stop",
-        times_s=np.array([0.0, MOTION_S]),
-        positions_rad=np.array([begin, end]),
-        velocities_rad_per_s=np.zeros((2, 6)),
-    )
-    run = threading.Thread(target=mover.execute, args=(motion,))
+    run = threading.Thread(target=mover.execute, args=(long_motion(mover.state().position_rad),))
     run.start()
     while len(notes.stamps_s) < 100:
         time.sleep(0.01)
     print(json.dumps("moving"), file=out, flush=True)
     run.join()
-    print(json.dumps(notes.braking_s()), file=out, flush=True)
+    print(json.dumps(braking_stamps_s(notes.stamps_s, notes.joint_rad)), file=out, flush=True)
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ class Priority(Enum):
 
     CONTROL = (0, 0.0001, 0)  # the control thread, which has a deadline in every period
     STOP = (-10, 0.0001, 2)  # the stop process
-    ANSWERS = (0, None, 1)  # the event loop of the service, which answers everybody
+    ANSWERS = (0, None, 1)  # the event loop of the service, which answers everybody, and the thread that ends a lease
     CLIENT = (5, None, 0)  # console and gateway, which may be late without harm
     WORK = (10, None, 0)  # tasks, readings and simulated worlds, which compute as much as they are given
 

@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from hal.caller import calling_as
 from hal.config import Cell, DeviceSection
 from hal.errors import CellError, DeviceUnavailable, InvalidRequest, LeaseError, Stopped
+from hal.priorities import Priority, take_priority
 from service.access.actor import actor
 from service.access.keys import FILE as KEYS_FILE
 from service.access.keys import KeyBook
@@ -346,6 +347,7 @@ class Service:
 
     def _watch_lease(self) -> None:
         """End the lease at the moment at which its heartbeat is overdue; a thread of its own, so that no record delays it."""
+        take_priority(Priority.ANSWERS)
         while not self._is_closing.wait(min(LOOK_S, self.lease.soonest_s())):
             self.lease.expire()
 

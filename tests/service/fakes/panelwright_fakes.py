@@ -6,6 +6,7 @@ import ctypes
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from hal.registry import Context
 from hal.simulated import Fault
 
 # immortal: continues to work after `close`. trouble: a file with `crash` or `away`, in effect while it exists
-# trace: a file that gets the first joint's set-points of an arm, and `stop`
+# trace: a file that gets the first joint's set-points of an arm, and `stop`, each with its time on the monotonic clock
 OPTIONS = {"fail", "crash_at_connect", "child_pid_file", "immortal", "trouble", "trace"}
 
 
@@ -158,7 +159,7 @@ class FakeArm(FakeDevice):
     def _note(self, line: str) -> None:
         if self._trace is not None:
             with self._trace.open("a") as file:
-                file.write(f"{line}\n")
+                file.write(f"{line} {time.monotonic():.6f}\n")
 
 
 class FakeGripper(FakeDevice):

@@ -194,11 +194,12 @@ def test_what_waits_for_its_modules_is_refused_when_the_service_ends() -> None:
 
 
 @pytest.mark.usefixtures("served")
-def test_the_event_loop_is_real_time_where_that_is_allowed() -> None:
+def test_the_event_loop_and_the_watch_of_the_lease_are_real_time_where_that_is_allowed() -> None:
     with ThreadPoolExecutor(1) as other:
         wanted = other.submit(lambda: take_priority(Priority.ANSWERS) or os.sched_getscheduler(0)).result()
-    loops = [thread.native_id for thread in threading.enumerate() if thread.name == "http"]
-    eventually(lambda: {os.sched_getscheduler(loop) for loop in loops if loop} == {wanted})  # unless it is busy
+    prompt = [thread.native_id for thread in threading.enumerate() if thread.name in ("http", "_watch_lease")]
+    assert len(prompt) >= 2
+    eventually(lambda: {os.sched_getscheduler(one) for one in prompt if one} == {wanted})  # unless the loop is busy
 
 
 def test_threads_that_compute_are_nicer_than_the_process(client: httpx2.Client) -> None:

@@ -49,7 +49,7 @@ class Scene:
         self.children = psutil.Process(service.pid).children(recursive=True)
 
     def lines(self) -> list[str]:
-        return self._trace.read_text().split("\n")[:-1]
+        return [line.split()[0] for line in self._trace.read_text().split("\n")[:-1]]
 
     def path_rad(self) -> list[float]:
         return [float(line) for line in self.lines() if line != "stop"]

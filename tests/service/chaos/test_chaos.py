@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from hal.child_python import module_command
 from service.chaos.acks import Ack, missing
-from service.chaos.faults import FAULTS, ends
+from service.chaos.faults import FAULTS, ODD_BODIES, ends
 from service.chaos.judge import last_line, unnamed
 from service.chaos.options import ChaosOptions, Round
 from service.chaos.plant import Plant
@@ -21,6 +22,7 @@ from service.chaos.table import report, write
 from service.chaos.watch import BACK_S, REST_S, STILL_RAD, Sight, motions_while_latched
 from service.tasks.journal_reader import Record
 from tests.service.conftest import WriteCell
+from tests.service.verbs import EchoRequest
 
 
 @pytest.mark.timeout(300)
@@ -45,6 +47,13 @@ def test_a_service_keeps_its_promises_while_it_is_stopped_and_fed_with_garbage(
     files = write(tmp_path / "out", rounds, chaos.final, lines=plant.lines)
     assert [file.name for file in files] == ["chaos.md", "chaos.json", "service.log"]
     assert len(json.loads(files[1].read_text())) == 3
+
+
+@pytest.mark.parametrize("body", ODD_BODIES)
+def test_no_beginning_of_a_broken_body_is_a_request_of_a_verb_that_needs_no_facts(body: bytes) -> None:
+    for cut in range(1, len(body) + 1):
+        with pytest.raises(ValidationError):
+            EchoRequest.model_validate_json(body[:cut])
 
 
 def sights(*rows: tuple[float, str | None, float]) -> list[Sight]:

@@ -1,8 +1,8 @@
 """Memory and descriptors of a service under a mix for long: `python -m benchmarks.soak [--minutes 30] [--settle 5]`.
 
-Missions, readings, pictures, listeners of the stream that come and go, stops with resets, and broken requests. Memory (proportional
-set size) and open descriptors of every process are sampled; after the first minutes, in which libraries and kernels load, the
-memory may grow by 5 MB and the descriptors not at all. Prints a table and the pass line.
+Missions, readings, pictures, listeners of the stream that come and go, stops with resets, and broken requests. The memory that
+each process has for itself (unique set size) and its open descriptors are sampled. After the first minutes, in which libraries
+and kernels load, the memory may grow by 5 MB and the descriptors not at all. Prints a table and the pass line.
 """
 
 from __future__ import annotations

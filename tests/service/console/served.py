@@ -169,7 +169,7 @@ class Cell:
 
 def leave_mission(folder: Path, *, done: list[str]) -> None:
     """Write what an earlier mission leaves: a report, and how far it got."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)  # of the same test, tried again
     told = {"started": "2026-01-03T00:00:00Z", "succeeded": False, "readings": [{"name": "setpoint"}], "actions": []}
     (folder / "report.json").write_text(json.dumps(told))
     (folder / "report.html").write_text("<h1>report</h1>")

@@ -53,7 +53,6 @@ signal.signal(signal.SIGUSR2, lambda *_: sum(range(10**12)))
 SERVICE = """
 import sys, threading
 from pathlib import Path
-from benchmarks.lost_clients import WAYS, scene
 from hal.config import load_cell
 from service.processes.supervisor import Supervisor
 supervisor = Supervisor(load_cell(Path(sys.argv[1])))

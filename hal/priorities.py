@@ -96,9 +96,10 @@ class RealtimeUnlessBusy:
     """
 
     def __init__(self) -> None:
+        ours = os.SCHED_RR | os.SCHED_RESET_ON_FORK if hasattr(os, "sched_getscheduler") else None
         self._is_ours = (
-            hasattr(os, "sched_getscheduler") and os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR
-        )
+            ours is not None and os.sched_getscheduler(0) == ours
+        )  # a class that somebody chose has no such flag
         self._had_s, self._begun_s = time.thread_time(), time.monotonic()
 
     def review(self) -> None:

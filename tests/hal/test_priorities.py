@@ -109,7 +109,11 @@ def test_a_thread_comes_first_for_a_moment_where_that_is_allowed(
 
 @pytest.mark.parametrize(
     ("begins_as", "busy_as"),
-    [(os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK), (os.SCHED_OTHER,) * 2],
+    [
+        (os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK),
+        (os.SCHED_OTHER,) * 2,
+        (os.SCHED_RR,) * 2,
+    ],
 )
 def test_a_thread_without_a_pause_is_real_time_no_more_until_it_pauses(
     begins_as: int, busy_as: int, monkeypatch: pytest.MonkeyPatch

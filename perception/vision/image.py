@@ -69,10 +69,10 @@ def as_gray(image: NDArray[Any]) -> Image:
         if image.shape[2] == 1
         else cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2GRAY)
     )
-    sample = gray[::4, ::4]
-    if np.percentile(sample, 99.5) <= BLACK_LEVEL:
+    dark, bright = np.percentile(gray[::4, ::4], (2.0, 99.5))
+    if bright <= BLACK_LEVEL:
         raise NotObservable("the image is black", hint="more light or a longer exposure; check the lens cap")
-    if np.percentile(sample, 2.0) >= WHITE_LEVEL:
+    if dark >= WHITE_LEVEL:
         raise NotObservable("the image is saturated", hint="less light or a shorter exposure")
     return np.require(gray, requirements=("C", "W"))  # the layout that compiled loops require
 

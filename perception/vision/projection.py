@@ -89,7 +89,7 @@ class PlateProjection:
     def project(self, points_m: ArrayLike) -> Array:
         """Return the pixels (N, 2) of plate points (N, 2 or 3)."""
         points = np.asarray(points_m, float)[:, :2]
-        u = np.column_stack([points, np.ones(len(points))]) @ self.px_from_plate.T
+        u = points @ self.px_from_plate[:, :2].T + self.px_from_plate[:, 2]
         return np.asarray(u[:, :2] / u[:, 2:])
 
     def moved(self, delta: Array) -> PlateProjection:

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from perception.vision import lights, quadrangle
 from perception.vision.bilinear import step_counts
+from perception.vision.finding.blind import PLATE_M, candidate_places, chosen, lay_out
 from perception.vision.finding.cables import without_cables
-from perception.vision.finding.components import components
-from perception.vision.finding.match import nearest, prepared
+from perception.vision.finding.features import look_at
+from perception.vision.finding.framing import one_plate
 from perception.vision.finding.segment import grow_regions
 from perception.vision.knowledge_files import load_knowledge
-from perception.vision.look import LENGTH
 from perception.vision.photographs.dial import read_dial
 from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.registration.edge_search import strongest_edges
@@ -39,10 +39,11 @@ def warm_up() -> None:
 
 def _find_objects(picture: NDArray[np.uint8]) -> None:
     """Run the loops that find objects and what lies across them once, on a gray picture."""
-    known = prepared(load_knowledge())
-    nearest(np.zeros((1, LENGTH)), known, mean_of=1)
     grow_regions(picture)
-    components((picture < 100).astype(np.uint8), diagonal=True)
+    view = one_plate(bright_plate(), PLATE_M).view
+    ground = lay_out(bright_plate(), view, PLATE_M)
+    places = candidate_places(ground.edges)
+    chosen(ground, places, look_at(ground, places), load_knowledge(), view, PLATE_M)
     banded = np.full((320, 480), 200, np.uint8)
     banded[:, 236:244] = 20  # a cable from top to bottom
     without_cables(banded, np.full(banded.shape, 200.0, np.float32))
@@ -50,6 +51,15 @@ def _find_objects(picture: NDArray[np.uint8]) -> None:
     strongest_edges(picture.astype(np.float32), middle, np.array([[1.0, 0.0]]), 4.0)
     ring_medians(picture[40].copy(), 9)
     step_counts(picture, 4)
+
+
+def bright_plate() -> NDArray[np.uint8]:
+    """Return a picture of a bright plate with a dark disc and a dark square before a dark room."""
+    v, u = np.mgrid[:480, :640]
+    picture = np.where((abs(u - 320) < 280) & (abs(v - 240) < 210), 200, 40)
+    picture[np.hypot(u - 200, v - 240) < 60] = 60
+    picture[(abs(u - 440) < 50) & (abs(v - 240) < 50)] = 60
+    return picture.astype(np.uint8)
 
 
 def upright_pointer() -> NDArray[np.uint8]:

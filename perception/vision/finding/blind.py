@@ -22,8 +22,8 @@ from perception.vision.finding.circles import find_circles
 from perception.vision.finding.components import components
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray
 from perception.vision.finding.framing import one_plate
-from perception.vision.finding.match import Prepared, nearest, nearest_look, nothing_column, prepared
-from perception.vision.finding.shapes import Edges, direction_maps, find_edges, find_rectangles, find_slots
+from perception.vision.finding.match import Prepared, nearest, nearest_look, nearest_of, nothing_column, prepared
+from perception.vision.finding.shapes import Edges, direction_maps, distinct, find_edges, find_rectangles, find_slots
 from perception.vision.image import as_gray
 from perception.vision.knowledge import NOTHING, Knowledge
 from perception.vision.noise import noise_sigma
@@ -31,7 +31,6 @@ from perception.vision.projection import PanelProjection
 from perception.vision.reading import ANSWER_AT
 
 PLATE_M = (0.40, 0.30)
-ROWS_APART = 3  # rows used for the noise estimate; enough, and a millisecond faster
 NOISY = 2.4  # gray levels; of synthetic overviews those of medium difficulty have 2.2 at most, hard ones 2.5 at least
 UPSIDE_DOWN = 0.15  # a panel is refused if its `uprightness` is below minus this
 # So many objects so certain confirm a plate; close-ups and rotated panels that resemble a plate have 3 at most.
@@ -53,6 +52,8 @@ CENTRING_STEPS_PX = (2.0, 0.8)
 CIRCLE_RADII_M = (0.004, 0.042)
 SIDES_M = (0.016, 0.095)
 SLOT_M = (0.034, 0.085)
+OVERLAP = 0.475  # objects overlap if their middles are closer than this share of the larger one's size
+SAME_PX = 1.5  # candidates closer than this are one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,12 +143,8 @@ def uprightness(
     middles = np.array([c.place_m for c in objects]) * [1.0, -1.0] + np.array(plate_m) / 2
     looks = look_at(ground, middles * PLATE_PX_PER_M)
     known = prepared(knowledge)
-    turned = half_turned(looks)
-    lead = 0.0
-    for k, candidate in enumerate(objects):
-        own = nearest(np.stack([looks[k], turned[k]]), known, kind=names.index(candidate.kind))[:, 0]
-        lead += float(own[1] - own[0])
-    return lead
+    kinds = np.array([names.index(c.kind) for c in objects])
+    return float((nearest_of(half_turned(looks), known, kinds) - nearest_of(looks, known, kinds)).sum())
 
 
 def lay_out(gray: Image, view: PanelProjection, plate_m: tuple[float, float]) -> Ground:
@@ -164,7 +161,7 @@ def lay_out(gray: Image, view: PanelProjection, plate_m: tuple[float, float]) ->
         picture=picture.astype(np.float32),
         edges=find_edges(picture),
         plate_gray=level,
-        noisy=noise_sigma(gray, rows_apart=ROWS_APART) > NOISY,
+        noisy=noise_sigma(gray) > NOISY,
     )
 
 
@@ -177,14 +174,7 @@ def candidate_places(edges: Edges) -> Array:
     places += find_slots(maps, least_px=SLOT_M[0] * s, most_px=SLOT_M[1] * s)
     places += _groups(edges)
     found = np.array(places, float).reshape(-1, 2)
-    close = np.abs(found[:, None] - found[None]).max(axis=2) < 1.5
-    known = np.zeros(len(found), bool)
-    distinct: list[int] = []
-    for k in range(len(found)):
-        if not known[k]:
-            distinct.append(k)
-            known |= close[k]
-    return found[distinct]
+    return found[distinct(found, np.full(2, SAME_PX))]
 
 
 def _groups(edges: Edges) -> list[tuple[float, float]]:
@@ -223,43 +213,66 @@ def chosen(
         kinds[:, nothing] = np.inf
     best = kinds.argmin(axis=1)
     near = kinds.min(axis=1)
+    reach_px = (
+        np.array([max(kind.size_m) if kind.middles_m is None else 0.0 for kind in knowledge.kinds])[best]
+        * PLATE_PX_PER_M
+    )
     order = np.argsort(near - np.minimum(to_nothing, near + 0.3))
-    taken: list[tuple[float, float, float]] = []
+    waiting = order[near[order] <= np.minimum(to_nothing[order] + SECOND_LOOK, FURTHEST)].tolist()
+    taken = np.zeros((0, 3))
     accepted, refused = [], []
-    for i in order:
-        if near[i] > to_nothing[i] + SECOND_LOOK:
-            break  # the rest is even nearer to nothing
-        if near[i] > FURTHEST:
-            continue
-        likest = knowledge.kinds[best[i]]
-        if likest.middles_m is None and _is_taken(places[i], max(likest.size_m) * PLATE_PX_PER_M, taken):
-            continue
-        place = _centred(ground, places[i], known, int(best[i]))
-        look = look_at(ground, place[None])
-        seen = nearest(look, known, mean_of=mean_of)[0]
-        to_other = float(seen[nothing]) if nothing is not None else np.inf
-        if nothing is not None:
-            seen[nothing] = np.inf
-        kind = knowledge.kinds[int(seen.argmin())]
-        middle = place
-        if kind.middles_m is not None:
-            across, up = kind.middles_m[nearest_look(look[0], kind, knowledge)]
-            middle = place + np.array([across, -up]) * PLATE_PX_PER_M
-            if _is_taken(middle, max(kind.size_m) * PLATE_PX_PER_M, taken):
+    while waiting:
+        now, waiting = _apart(places, reach_px, waiting, taken)
+        if not now:
+            break
+        at = _centred(ground, places[now], known, best[now])
+        seen_looks = look_at(ground, at)
+        for i, place, look, seen in zip(now, at, seen_looks, nearest(seen_looks, known, mean_of=mean_of), strict=True):
+            if _is_taken(places[i], reach_px[i], taken):
                 continue
-        even = NOISY_EVEN if ground.noisy else EVEN
-        candidate = _candidate(place, middle, names, seen, to_other, kind.size_m, view, plate_m, even=even)
-        if candidate.reason is None:
-            taken.append((middle[0], middle[1], max(kind.size_m) * PLATE_PX_PER_M))
-            accepted.append(candidate)
-        else:
-            refused.append(candidate)
+            to_other = float(seen[nothing]) if nothing is not None else np.inf
+            if nothing is not None:
+                seen[nothing] = np.inf
+            kind = knowledge.kinds[int(seen.argmin())]
+            middle = place
+            if kind.middles_m is not None:
+                across, up = kind.middles_m[nearest_look(look, kind, knowledge)]
+                middle = place + np.array([across, -up]) * PLATE_PX_PER_M
+                if _is_taken(middle, max(kind.size_m) * PLATE_PX_PER_M, taken):
+                    continue
+            even = NOISY_EVEN if ground.noisy else EVEN
+            candidate = _candidate(place, middle, names, seen, to_other, kind.size_m, view, plate_m, even=even)
+            if candidate.reason is None:
+                taken = np.vstack([taken, [*middle, max(kind.size_m) * PLATE_PX_PER_M]])
+                accepted.append(candidate)
+            else:
+                refused.append(candidate)
     return (*accepted, *refused)
 
 
-def _is_taken(place: Array, reach: float, taken: Sequence[tuple[float, float, float]]) -> bool:
-    """Return whether an object of that reach overlaps an accepted one."""
-    return any(max(abs(place[0] - a), abs(place[1] - b)) < 0.475 * max(reach, c) for a, b, c in taken)
+def _apart(places: Array, reach_px: Array, waiting: Sequence[int], taken: Array) -> tuple[list[int], list[int]]:
+    """Return which of the waiting candidates overlap no better one, and which have to wait for what becomes of that one.
+
+    Those that overlap an accepted object (`taken`) are in neither. A reach of 0 means that the middle is not known yet.
+    """
+    now, later = [], []
+    claimed = taken
+    for i in waiting:
+        if _is_taken(places[i], reach_px[i], taken):
+            continue
+        if _is_taken(places[i], reach_px[i], claimed):
+            later.append(i)
+            continue
+        now.append(i)
+        if reach_px[i] > 0:
+            claimed = np.vstack([claimed, [*places[i], reach_px[i]]])
+    return now, later
+
+
+def _is_taken(place: Array, reach: float, taken: Array) -> bool:
+    """Return whether an object of that reach overlaps one of `taken` (N, 3; place and reach); one without reach does not."""
+    apart = np.abs(taken[:, :2] - place).max(axis=1)
+    return reach > 0 and bool((apart < OVERLAP * np.maximum(taken[:, 2], reach)).any())
 
 
 def _refusal(near: float, confidence: float, rival: str) -> str | None:
@@ -272,19 +285,22 @@ def _refusal(near: float, confidence: float, rival: str) -> str | None:
     return f"as much like {other}: come closer, or change the angle or the light"
 
 
-def _centred(ground: Ground, place: Array, known: Prepared, kind: int) -> Array:
-    """Return the place near the given one whose features are most similar to the kind `kind` (column of `known`).
+def _centred(ground: Ground, places: Array, known: Prepared, kinds: NDArray[np.int64]) -> Array:
+    """Return the place (N, 2) near each given one whose features are most similar to its kind (N,; column of `known`).
 
     A shadow or a wall may shift the middle of a sub-object, but hardly affects the features as a whole, which were
     taught at the true middles. The result is the mean of a cross of places, weighted towards small distances, computed
     twice, the second time finer.
     """
     for step in CENTRING_STEPS_PX:
-        tried = place + step * CROSS
-        d = nearest(look_at(ground, tried), known, kind=kind)[:, 0]
-        w = np.exp(-(d - d.min()) / max(0.25 * float(d.max() - d.min()), 1e-6))
-        place = (w[:, None] * tried).sum(axis=0) / w.sum()
-    return np.asarray(place)
+        tried = places[:, None] + step * CROSS
+        d = nearest_of(look_at(ground, tried.reshape(-1, 2)), known, np.repeat(kinds, len(CROSS))).reshape(
+            -1, len(CROSS)
+        )
+        least, most = d.min(axis=1, keepdims=True), d.max(axis=1, keepdims=True)
+        w = np.exp(-(d - least) / np.maximum(0.25 * (most - least), 1e-6))
+        places = (w[:, :, None] * tried).sum(axis=1) / w.sum(axis=1, keepdims=True)
+    return places
 
 
 def _candidate(

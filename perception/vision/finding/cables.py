@@ -37,7 +37,8 @@ def without_cables(picture: Image, plate_gray: Float32) -> Image:
     """Return the picture (H, W) of a plate with its cables interpolated away; the same picture if there are none."""
     height, width = picture.shape
     cells = (width // ACROSS, height // ALONG)
-    small, level = (cv2.resize(p, cells, interpolation=cv2.INTER_AREA) for p in (picture, plate_gray))
+    whole = (slice(ALONG * cells[1]), slice(ACROSS * cells[0]))  # OpenCV is four times as fast by whole factors
+    small, level = (cv2.resize(p[whole], cells, interpolation=cv2.INTER_AREA) for p in (picture, plate_gray))
     dark = _darkness(np.asarray(small, np.float32), np.asarray(level, np.float32) + np.float32(10.0), HALVES)
     gain = np.pad(dark - np.float32(EVEN), ((0, 0), (MARGIN, MARGIN)))
     out = picture

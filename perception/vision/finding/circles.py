@@ -7,7 +7,6 @@ Recognition 13(2), 1981). A candidate is then verified by the share of its outli
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
-from perception.vision.finding.shapes import Edges, Float32
+from perception.vision.finding.shapes import Edges, Float32, distinct
 
 SMALL_PX = 24.0  # radius up to which circles are searched in small cells
 CIRCLE_SAMPLES = 40  # points on an outline
@@ -26,6 +25,7 @@ ALIGNED = 0.8  # least cosine between an edge's gradient and the outline's norma
 # Steps of the search around a peak of the votes, whose cells are larger for large radii.
 STEPS_LARGE_PX = np.array([3.0, 1.5, 0.7])
 STEPS_SMALL_PX = STEPS_LARGE_PX[1:]
+SAME_PX = np.array([4.0, 4.0, 2.0])  # differences of u, v and radius below which two circles are one
 TURNS = np.linspace(0, 2 * np.pi, CIRCLE_SAMPLES, endpoint=False)
 NORMALS = np.column_stack([np.sin(TURNS), -np.cos(TURNS)])
 
@@ -42,13 +42,13 @@ class Circle:
 
 def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circle]:
     """Return the verified circles with radii between `least_px` and `most_px`, best first, without near-duplicates."""
-    v, u = np.nonzero(edges.thin)
+    v, u = np.divmod(np.flatnonzero(edges.thin), edges.thin.shape[1])
     gx, gy = edges.along_x[v, u], edges.along_y[v, u]
     length = np.hypot(gx, gy)
     points = (u.astype(np.float64), v.astype(np.float64), gx / length, gy / length)
     found = []
     # The direction of an edge is wrong by a few degrees, so the votes of large circles scatter and need larger cells.
-    for low, high, step, cell in ((least_px, SMALL_PX, 1.0, 2), (max(least_px, SMALL_PX), most_px, 2.0, 4)):
+    for low, high, step, cell in ((least_px, SMALL_PX, 1.5, 2), (max(least_px, SMALL_PX), most_px, 2.0, 4)):
         radii = np.arange(round(low), round(high) + 1, step)
         if len(radii) < 3:
             continue
@@ -66,7 +66,7 @@ def find_circles(edges: Edges, *, least_px: float, most_px: float) -> list[Circl
 def _pool(votes: Float32, radii: Array) -> None:
     """Sum the votes in place over neighbouring places and radii, and divide by the circumference."""
     for plane in votes:
-        cv2.GaussianBlur(plane, (0, 0), 0.9, dst=plane)
+        cv2.GaussianBlur(plane, (5, 5), 0.9, dst=plane)
     _average(votes, radii.astype(np.float32))
 
 
@@ -111,11 +111,9 @@ def circle_coverage(edges: Edges, circles: Array) -> Array:
 
 def _distinct(circles: list[Circle]) -> list[Circle]:
     """Return the circles, best first, without those that nearly equal a better one."""
-    kept: list[Circle] = []
-    for c in sorted(circles, key=lambda c: c.coverage, reverse=True):
-        if not any(abs(c.radius - k.radius) < 2 and hypot(c.u - k.u, c.v - k.v) < 4 for k in kept):
-            kept.append(c)
-    return kept
+    ordered = sorted(circles, key=lambda c: c.coverage, reverse=True)
+    values = np.array([[c.u, c.v, c.radius] for c in ordered]).reshape(-1, 3)
+    return [ordered[k] for k in distinct(values, SAME_PX)]
 
 
 @compiled

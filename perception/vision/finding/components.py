@@ -1,4 +1,7 @@
-"""Connected components of a sparse mask by runs: only boxes and middles, which is ten times faster than labelling."""
+"""Connected components of a sparse mask by runs: only boxes and middles, which is ten times faster than labelling.
+
+A run is a row of neighbouring pixels; runs (3, N) are their first and last columns and their rows, in raster order.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ from hal.arrays import Array
 from hal.jit import compiled, inlined
 from hal.union_find import find, unite
 
+Runs = NDArray[np.int32]
+
 
 def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
     """Return left, top, width, height and middle (u, v) of every connected part (N, 6), in raster order.
@@ -17,38 +22,69 @@ def components(mask: NDArray[np.uint8], *, diagonal: bool) -> Array:
         mask: (H, W) uint8, nonzero inside.
         diagonal: whether pixels that touch at a corner are connected.
     """
-    return np.asarray(_components(np.ascontiguousarray(mask), 1 if diagonal else 0))
+    return connected(runs_of(np.ascontiguousarray(mask)), diagonal=diagonal)
+
+
+def connected(runs: Runs, *, diagonal: bool) -> Array:
+    """Return the `components` of the pixels in runs."""
+    return np.asarray(_connected(runs, 1 if diagonal else 0))
 
 
 @compiled
-def _components(mask: NDArray[np.uint8], reach: int) -> Array:
-    """Join the runs of each row to the overlapping runs of the row above (union-find), and return `components`.
-
-    `reach`: 1 if runs that touch at a corner overlap, else 0.
-    """
+def runs_of(mask: NDArray[np.uint8]) -> Runs:
+    """Return the runs of nonzero pixels of a mask (H, W)."""
     height, width = mask.shape
-    most = height * (width + 1) // 2 + 1
-    parent, first, last, row = np.empty((4, most), np.int32)
-    made = above = 0
+    runs = np.empty((3, height * (width + 1) // 2 + 1), np.int32)
+    count = 0
     for v in range(height):
-        begin = made
         u = 0
         while u < width:
             if mask[v, u] == 0:
                 u += 1
                 continue
-            parent[made], first[made], row[made] = made, u, v
+            runs[0, count], runs[2, count] = u, v
             while u < width and mask[v, u] != 0:
                 u += 1
-            last[made] = u - 1
-            for k in range(above, begin):
-                if first[k] > last[made] + reach:
-                    break
-                if last[k] >= first[made] - reach:
-                    unite(parent, k, made)
-            made += 1
-        above = begin
-    return _boxes(parent[:made], first, last, row)
+            runs[1, count] = u - 1
+            count += 1
+    return runs[:, :count].copy()
+
+
+@compiled
+def bridged(runs: Runs, gap_px: int, least_px: int) -> Runs:
+    """Return the runs with the gaps of up to `gap_px` between them filled, without those shorter than `least_px`."""
+    out = np.empty_like(runs)
+    count, k = 0, 0
+    while k < runs.shape[1]:
+        first, last, row = runs[0, k], runs[1, k], runs[2, k]
+        k += 1
+        while k < runs.shape[1] and runs[2, k] == row and runs[0, k] - last <= gap_px + 1:
+            last = runs[1, k]
+            k += 1
+        if last - first + 1 >= least_px:
+            out[0, count], out[1, count], out[2, count] = first, last, row
+            count += 1
+    return out[:, :count].copy()
+
+
+@compiled
+def _connected(runs: Runs, reach: int) -> Array:
+    """Join the runs of each row to the overlapping runs of the row above (union-find), and return their boxes.
+
+    `reach`: 1 if runs that touch at a corner overlap, else 0.
+    """
+    first, last, row = runs[0], runs[1], runs[2]
+    parent = np.arange(runs.shape[1]).astype(np.int32)
+    above = begin = 0  # first run of the row above, and of this row
+    for k in range(runs.shape[1]):
+        if k > 0 and row[k] != row[k - 1]:
+            above, begin = begin if row[k] == row[k - 1] + 1 else k, k
+        for j in range(above, begin):
+            if first[j] > last[k] + reach:
+                break
+            if last[j] >= first[k] - reach:
+                unite(parent, j, k)
+    return _boxes(parent, first, last, row)
 
 
 @inlined

@@ -16,7 +16,7 @@ from perception.vision.finding.plate import Plate, find_plate
 from perception.vision.projection import CameraProjection, PanelProjection, PlateProjection
 from perception.vision.registration.register import register
 
-COARSE_WIDTH_PX = 240
+COARSE_WIDTH_PX = 160
 LEAST_SHARE = 0.06  # of the image; on smaller plates no objects are visible
 SECOND_SHARE = 0.3  # of the largest region's area; a second panel of this size could be the intended one
 RECTANGLE_FILL = 0.85  # least share of its smallest enclosing rectangle that a plate's region fills

@@ -56,17 +56,28 @@ def distances(looks: Array, knowledge: Knowledge) -> Array:
     return nearest(looks, prepared(knowledge))
 
 
-def nearest(looks: Array, known: Prepared, *, kind: int | None = None, mean_of: int = 1) -> Array:
-    """Return `distances` to prepared examples; with `kind`, distances (N, 1) to the examples of that kind only.
+def nearest(looks: Array, known: Prepared, *, mean_of: int = 1) -> Array:
+    """Return `distances` to prepared examples.
 
     `mean_of`: number of nearest examples of every kind over which the distance is averaged. A missing example counts as
     `NEXT_FURTHER` more distant than the last, so that a kind with one example is neither preferred nor excluded.
     """
-    first = known.first if kind is None else known.first[kind : kind + 2]
+    kinds = np.tile(np.array([0, len(known.first) - 1]), (len(looks), 1))
+    return _measured(looks, known, kinds, mean_of)
+
+
+def nearest_of(looks: Array, known: Prepared, kinds: NDArray[np.int64]) -> Array:
+    """Return the distance (N,) of each look to the nearest prepared example of its own kind (N,)."""
+    return _measured(looks, known, np.column_stack([kinds, kinds + 1]), mean_of=1)[:, 0]
+
+
+def _measured(looks: Array, known: Prepared, kinds: NDArray[np.int64], mean_of: int) -> Array:
+    """Return the distances of each look to the kinds from `kinds[:, 0]` up to `kinds[:, 1]`, as many for each look."""
     scaled = (looks * known.gain).astype(np.float32)
     clips = (CLIP * known.weights).astype(np.float32)
     total = float(known.weights.sum())
-    return np.asarray(_nearest(scaled, known.columns, first, clips, mean_of, NEXT_FURTHER * total), float) / total
+    found = _nearest(scaled, known.columns, known.first, kinds, clips, mean_of, NEXT_FURTHER * total)
+    return np.asarray(found, float) / total
 
 
 def nearest_look(look: Array, kind: TaughtKind, knowledge: Knowledge) -> int:
@@ -86,6 +97,7 @@ def _nearest(
     looks: NDArray[np.float32],
     columns: NDArray[np.float32],
     first: NDArray[np.int64],
+    kinds: NDArray[np.int64],
     clips: NDArray[np.float32],
     mean_of: int,
     step: float,
@@ -95,18 +107,18 @@ def _nearest(
     The inner loop is vectorised with an order of summation that does not depend on the processor.
     """
     n, length = looks.shape
-    begin, end = first[0], first[-1]
-    total = np.empty(end - begin, np.float32)
-    out = np.empty((n, len(first) - 1), np.float32)
+    out = np.empty((n, kinds[0, 1] - kinds[0, 0] if n else 0), np.float32)
     for i in range(n):
-        total[:] = 0.0
+        begin, end = first[kinds[i, 0]], first[kinds[i, 1]]
+        total = np.zeros(end - begin, np.float32)
         for j in range(length):
             number, row, clip = looks[i, j], columns[j, begin:end], clips[j]
             for k in range(len(total)):
                 d = abs(number - row[k])
                 total[k] += d if d < clip else clip
-        for c in range(len(first) - 1):
-            part = total[first[c] - begin : first[c + 1] - begin]
+        for c in range(out.shape[1]):
+            k = kinds[i, 0] + c
+            part = total[first[k] - begin : first[k + 1] - begin]
             out[i, c] = part.min() if mean_of == 1 else _mean_of_least(part, mean_of, step)
     return out
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array, Image
+from hal.jit import compiled
 from perception.vision.finding.plate_pose import rigid_plate
 from perception.vision.projection import PlateProjection, homography
 from perception.vision.registration.outline import Outline, rectangle
@@ -181,8 +182,9 @@ def _plate_mask(small: Image) -> NDArray[np.bool_]:
     smooth = cv2.GaussianBlur(small, (0, 0), 1.5)
     # In logarithms a plate's ratio to the room is constant even if the light fades; glare and white faces are capped.
     level = np.log(smooth.astype(np.float32) + 4.0)
-    held = np.minimum(level, float(np.median(level)) + 0.2)
-    low, high = float(np.percentile(held, 1)), float(held.max())
+    low, median = (float(x) for x in np.percentile(level, (1, 50)))
+    held = np.minimum(level, median + 0.2)
+    high = float(held.max())
     coded = np.clip((held - low) / max(high - low, 1e-3) * 255.0, 0, 255).astype(np.uint8)
     _, bright = cv2.threshold(coded, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     middle = bright[bright.shape[0] // 4 : -bright.shape[0] // 4, bright.shape[1] // 4 : -bright.shape[1] // 4]
@@ -216,18 +218,19 @@ def _side(mask: NDArray[np.bool_], side: int) -> Array | None:
     return line if side in (0, 2) else line[[1, 0, 2]]
 
 
+@compiled
 def _robust_line(x: Array, y: Array) -> tuple[float, float]:
     """Return slope and intercept by least squares with Cauchy weights, starting from medians."""
     half = len(x) // 2
-    pairs = (y[half : half * 2] - y[:half]) / np.maximum(x[half : half * 2] - x[:half], 1e-9)
-    slope = float(np.median(pairs))
+    slope = float(np.median((y[half : half * 2] - y[:half]) / np.maximum(x[half : half * 2] - x[:half], 1e-9)))
     start = float(np.median(y - slope * x))
     for _ in range(8):
         r = y - slope * x - start
         w = 1.0 / (1.0 + (r / max(1.5 * float(np.median(np.abs(r))), 0.4)) ** 2)
-        A = np.column_stack([x, np.ones_like(x)])
-        slope, start = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
-    return float(slope), float(start)
+        mean_x, mean_y = (w * x).sum() / w.sum(), (w * y).sum() / w.sum()
+        slope = (w * (x - mean_x) * (y - mean_y)).sum() / (w * (x - mean_x) ** 2).sum()
+        start = mean_y - slope * mean_x
+    return slope, start
 
 
 def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, focal: float) -> Array | None:

@@ -49,7 +49,8 @@ class RigidPlate:
     def project(self, points_m: ArrayLike) -> Array:
         """Return the pixels (N, 2) of points (N, 2 or 3) of the plate's plane; NaN behind the camera."""
         points = np.asarray(points_m, float)[:, :2]
-        h = np.column_stack([points, np.ones(len(points))]) @ self.px_from_plate.T
+        H = self.px_from_plate
+        h = points @ H[:, :2].T + H[:, 2]
         return np.asarray(h[:, :2] / np.where(h[:, 2:] > 0, h[:, 2:], np.nan))
 
     def moved(self, delta: Array) -> RigidPlate:

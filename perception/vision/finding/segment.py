@@ -21,7 +21,6 @@ from perception.vision.noise import noise_sigma
 TOLERANCE = 9.0  # gray levels; least tolerance
 # Tolerance in sigmas of the noise; with less, thousands of single pixels remain, because bright parts are noisier.
 NOISES = 6.0
-ROWS_APART = 4  # rows between those that are used to estimate the noise
 
 Moments = tuple[np.int64, np.int64, np.int64]  # count, sum and sum of squares of gray levels
 SPREADS = 2.0  # tolerance in standard deviations of the region itself
@@ -54,7 +53,7 @@ def grow_regions(gray: Image, *, tolerance: float | None = None) -> ImageRegions
     """
     gray = np.ascontiguousarray(gray)
     if tolerance is None:
-        tolerance = max(TOLERANCE, NOISES * noise_sigma(gray, rows_apart=ROWS_APART))
+        tolerance = max(TOLERANCE, NOISES * noise_sigma(gray))
     labels, sums = _grow(gray, tolerance)
     count = sums[:, 0]
     mean = sums[:, 1] / count

@@ -12,15 +12,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Image
-from perception.vision.finding.components import components
+from hal.arrays import Array, Image
+from hal.jit import compiled
+from perception.vision.finding.components import Runs, bridged, connected, runs_of
 from perception.vision.noise import noise_sigma
 
 Float32 = NDArray[np.float32]
-DirectionMaps = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # flat edges, upright edges
+Mask = NDArray[np.uint8]
+Indices = NDArray[np.int64]
 
+TEXTURE = 0.022  # share of the gray level that the slopes of a printed or brushed surface reach
+STEEPER = 1.8  # a gradient so much stronger in one direction than in the other is that of a horizontal or vertical edge
 MAX_SIDES = 90  # longest runs that are paired
+SIDE_GAP_PX, SLOT_GAP_PX = 8, 24  # gaps that are bridged, by a cable for example
+SIDE_MOST_PX = 6  # largest thickness of a side
+SIDES_UNEVEN_PX = 9  # opposite sides end less than this apart
 SLOT_MOST_PX = 12  # largest width of a slot
+LEAST_BOX_PX = 4
+LEAST_COVERAGE = 0.55
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,6 +47,17 @@ class Edges:
     strength: Float32
     strong: NDArray[np.bool_]
     thin: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """Edges that lie along the rows of a picture: the mask (H, W) of their pixels, and its `runs_of`."""
+
+    mask: Mask
+    runs: Runs
+
+
+DirectionMaps = tuple[Rows, Rows]  # horizontal edges, and vertical ones of the transposed picture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,124 +78,148 @@ def find_edges(picture: Image, *, sigma_px: float = 1.0) -> Edges:
     gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125), np.float32)
     strength = np.asarray(cv2.magnitude(gx, gy), np.float32)
     least = 2.0 + 0.5 * noise_sigma(picture) / sigma_px
-    strong = strength > np.maximum(least, 0.022 * smooth)
-    return Edges(along_x=gx, along_y=gy, strength=strength, strong=strong, thin=_thinned(gx, gy, strength, strong))
+    strong, thin = _ridges(gx, gy, strength, smooth, np.float32(least))
+    return Edges(along_x=gx, along_y=gy, strength=strength, strong=strong, thin=thin)
 
 
 def find_rectangles(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[Rectangle]:
     """Return upright rectangles with sides between `least_px` and `most_px`, verified on all four sides."""
     flat, upright = maps
-    rows, columns = _runs(flat, least_px), _runs(upright.T, least_px)
-    flat_sum, upright_sum = _sums(flat, 1), _sums(upright, 0)
-    found: list[Rectangle] = []
-    for top, bottom in _pairs(rows, least_px, most_px):
-        x0, x1 = (top[0] + bottom[0]) / 2, (top[1] + bottom[1]) / 2
-        found.append(_judged(flat_sum, upright_sum, x0, top[2], x1, bottom[2]))
-    for left, right in _pairs(columns, least_px, most_px):
-        y0, y1 = (left[0] + right[0]) / 2, (left[1] + right[1]) / 2
-        found.append(_judged(flat_sum, upright_sum, left[2], y0, right[2], y1))
-    found = [r for r in found if r.coverage >= 0.55]
-    kept: list[Rectangle] = []
-    for r in sorted(found, key=lambda r: r.coverage, reverse=True):
-        if not any(
-            abs(r.u - k.u) + abs(r.v - k.v) < 5 and abs(r.width - k.width) < 5 and abs(r.height - k.height) < 5
-            for k in kept
-        ):
-            kept.append(r)
-    return kept
+    boxes = _between_sides(_sides(flat, least_px), least_px, most_px)
+    across = _between_sides(_sides(upright, least_px), least_px, most_px)
+    boxes = np.concatenate([boxes, across[:, [1, 0, 3, 2]]])
+    coverage = _coverage(flat.mask, upright.mask, boxes)
+    boxes, coverage = boxes[coverage >= LEAST_COVERAGE], coverage[coverage >= LEAST_COVERAGE]
+    order = np.argsort(-coverage, kind="stable")
+    laid = np.hstack([boxes[order, :2] + boxes[order, 2:], boxes[order, 2:] - boxes[order, :2]]) * [0.5, 0.5, 1.0, 1.0]
+    return [
+        Rectangle(u=u, v=v, width=width, height=height, coverage=float(share))
+        for (u, v, width, height), share in (
+            (laid[k].tolist(), coverage[order[k]]) for k in distinct(laid, np.array([3.0, 3.0, 5.0, 5.0]))
+        )
+    ]
+
+
+@compiled
+def distinct(values: Array, apart: Array) -> Indices:
+    """Return which of the rows (N, D) differ from every earlier one of these by `apart` (D,) or more in some column."""
+    kept = np.empty(len(values), np.int64)
+    count = 0
+    for k in range(len(values)):
+        is_new = True
+        for j in kept[:count]:
+            column = 0
+            while column < len(apart) and abs(values[k, column] - values[j, column]) < apart[column]:
+                column += 1
+            if column == len(apart):
+                is_new = False
+                break
+        if is_new:
+            kept[count] = k
+            count += 1
+    return kept[:count]
 
 
 def find_slots(maps: DirectionMaps, *, least_px: float, most_px: float) -> list[tuple[float, float]]:
     """Return the middles of long thin horizontal or vertical shapes: slots and tracks, even if partly covered."""
     found = []
     flat, upright = maps
-    for mask, is_flat in ((flat, True), (upright.T, False)):
-        bridged = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((1, 25), np.uint8))
-        bridged = cv2.morphologyEx(bridged, cv2.MORPH_OPEN, np.ones((1, round(least_px)), np.uint8))
-        for left, _, width, height, _, across in components(np.asarray(bridged, np.uint8), diagonal=True):
+    for rows, is_flat in ((flat, True), (upright, False)):
+        tracks = bridged(rows.runs, SLOT_GAP_PX, round(least_px))
+        for left, _, width, height, _, across in connected(tracks, diagonal=True):
             if least_px <= width <= most_px and height <= SLOT_MOST_PX:
                 along = float(left + (width - 1) / 2)
                 found.append((along, float(across)) if is_flat else (float(across), along))
     return found
 
 
-def _thinned(gx: Float32, gy: Float32, s: Float32, strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the strong pixels that are not weaker than both neighbours along the gradient (to the nearest axis)."""
-    out = np.zeros(strong.shape, bool)
-    middle = s[1:-1, 1:-1]
-    across_x = np.abs(gx[1:-1, 1:-1]) >= np.abs(gy[1:-1, 1:-1])
-    flat = (middle >= s[1:-1, :-2]) & (middle > s[1:-1, 2:])
-    upright = (middle >= s[:-2, 1:-1]) & (middle > s[2:, 1:-1])
-    out[1:-1, 1:-1] = strong[1:-1, 1:-1] & np.where(across_x, flat, upright)
-    return out
+@compiled
+def _ridges(
+    gx: Float32, gy: Float32, s: Float32, smooth: Float32, least: np.float32
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return where a gradient is strong, and where it is moreover no weaker than both neighbours along its nearest axis.
+
+    Args:
+        s: magnitude of the gradient (gx, gy) of the picture `smooth`.
+        least: magnitude that noise does not reach.
+    """
+    height, width = s.shape
+    strong, thin = np.zeros((height, width), np.bool_), np.zeros((height, width), np.bool_)
+    share = np.float32(TEXTURE)
+    for y in range(height):
+        for x in range(width):
+            strong[y, x] = s[y, x] > max(least, share * smooth[y, x])
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            here = s[y, x]
+            is_across_x = abs(gx[y, x]) >= abs(gy[y, x])
+            is_flat = (here >= s[y, x - 1]) & (here > s[y, x + 1])
+            is_upright = (here >= s[y - 1, x]) & (here > s[y + 1, x])
+            thin[y, x] = strong[y, x] & ((is_across_x & is_flat) | (~is_across_x & is_upright))
+    return strong, thin
 
 
 def direction_maps(edges: Edges) -> DirectionMaps:
     """Return where there are horizontal edges, and where vertical ones, each widened by one pixel on both sides."""
-    ax, ay = np.abs(edges.along_x), np.abs(edges.along_y)
-    ones = np.ones(3, np.uint8)
-    flat = cv2.dilate((edges.thin & (ay > 1.8 * ax)).astype(np.uint8), ones[:, None])
-    upright = cv2.dilate((edges.thin & (ax > 1.8 * ay)).astype(np.uint8), ones[None, :])
-    return flat > 0, upright > 0
+    flat, upright = _directions(edges.along_x, edges.along_y, edges.thin)
+    return Rows(mask=flat, runs=runs_of(flat)), Rows(mask=upright, runs=runs_of(upright))
 
 
-def _runs(flat: NDArray[np.bool_], least_px: float) -> list[tuple[float, float, float]]:
-    """Return (start, end, row) of horizontal edges longer than `least_px`, with short gaps bridged, longest first."""
-    bridged = cv2.morphologyEx(flat.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8))
-    bridged = cv2.morphologyEx(bridged, cv2.MORPH_OPEN, np.ones((1, max(5, round(0.8 * least_px))), np.uint8))
-    runs = [
-        (float(left), float(left + width - 1), float(row))
-        for left, _, width, height, _, row in components(np.asarray(bridged, np.uint8), diagonal=False)
-        if width >= least_px and height <= 6
-    ]
-    runs.sort(key=lambda run: run[0] - run[1])
-    return runs[:MAX_SIDES]
+@compiled
+def _directions(gx: Float32, gy: Float32, thin: NDArray[np.bool_]) -> tuple[Mask, Mask]:
+    """Return the mask (H, W) of the widened horizontal edges, and the transposed mask (W, H) of the vertical ones."""
+    height, width = thin.shape
+    flat, upright = np.zeros((height, width), np.uint8), np.zeros((width, height), np.uint8)
+    for y in range(height):
+        for x in range(width):
+            if not thin[y, x]:
+                continue
+            across, along = abs(gx[y, x]), abs(gy[y, x])
+            if along > STEEPER * across:
+                flat[max(y - 1, 0) : y + 2, x] = 1
+            elif across > STEEPER * along:
+                upright[max(x - 1, 0) : x + 2, y] = 1
+    return flat, upright
 
 
-def _pairs(
-    runs: list[tuple[float, float, float]], least_px: float, most_px: float
-) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-    """Return the pairs of runs that are opposite sides of a rectangle."""
-    out = []
-    for i, a in enumerate(runs):
-        for b in runs[i + 1 :]:
-            gap = abs(a[2] - b[2])
-            if (
-                least_px <= gap <= most_px
-                and abs(a[0] - b[0]) < 9
-                and abs(a[1] - b[1]) < 9
-                and a[1] - a[0] <= most_px + 9
-            ):
-                out.append((a, b) if a[2] < b[2] else (b, a))
-    return out
+def _sides(rows: Rows, least_px: float) -> Array:
+    """Return start, end and row (N, 3) of the edges longer than `least_px`, longest first."""
+    long = bridged(rows.runs, SIDE_GAP_PX, round(0.8 * least_px))
+    left, _, width, height, _, row = connected(long, diagonal=False).T
+    sides = np.column_stack([left, left + width - 1, row])[(width >= least_px) & (height <= SIDE_MOST_PX)]
+    return np.asarray(sides[np.argsort(sides[:, 0] - sides[:, 1], kind="stable")[:MAX_SIDES]])
 
 
-def _sums(mask: NDArray[np.bool_], axis: int) -> NDArray[np.int32]:
-    """Return the cumulative sums of a mask along an axis, beginning with 0."""
-    pad = [(0, 0), (0, 0)]
-    pad[axis] = (1, 0)
-    return np.asarray(np.pad(np.cumsum(mask, axis=axis, dtype=np.int32), pad))
+def _between_sides(runs: Array, least_px: float, most_px: float) -> Array:
+    """Return the boxes (N, 4; start, row, end, row) between runs that are opposite sides of a rectangle."""
+    one, other = np.triu_indices(len(runs), 1)
+    a, b = runs[one], runs[other]
+    apart = np.abs(a - b)
+    fits = (apart[:, 2] >= least_px) & (apart[:, 2] <= most_px) & (apart[:, :2] < SIDES_UNEVEN_PX).all(axis=1)
+    fits &= a[:, 1] - a[:, 0] <= most_px + SIDES_UNEVEN_PX
+    a, b = a[fits], b[fits]
+    start, end, _ = ((a + b) / 2).T
+    return np.column_stack([start, np.minimum(a[:, 2], b[:, 2]), end, np.maximum(a[:, 2], b[:, 2])])
 
 
-def _judged(
-    flat: NDArray[np.int32], upright: NDArray[np.int32], x0: float, y0: float, x1: float, y1: float
-) -> Rectangle:
-    """Return a rectangle with its coverage: the mean over its four sides, lowered by the worst side.
+@compiled
+def _coverage(flat: Mask, upright: Mask, boxes: Array) -> Array:
+    """Return the coverage (N,) of boxes (N, 4; x0, y0, x1, y1): the mean over the sides, lowered by the worst side.
 
-    `flat`, `upright`: cumulative sums of the direction maps.
+    A vertical side may be a pixel beside the box. `flat`, `upright`: the masks of the direction maps.
     """
-    a, b = round(max(x0, 0)), round(min(x1, flat.shape[1] - 2))
-    c, d = round(max(y0, 0)), round(min(y1, upright.shape[0] - 2))
-    if b - a < 4 or d - c < 4:
-        return Rectangle(u=x0, v=y0, width=0.0, height=0.0, coverage=0.0)
-    sides = [(flat[row, b + 1] - flat[row, a]) / (b - a + 1) for row in (c, d)]
-    sides += [
-        max(
-            (upright[d + 1, col + k] - upright[c, col + k]) / (d - c + 1)
-            for k in (-1, 0, 1)
-            if 0 <= col + k < upright.shape[1]
-        )
-        for col in (a, b)
-    ]
-    coverage = float(np.mean(sides) * 0.6 + min(sides) * 0.4)
-    return Rectangle(u=(x0 + x1) / 2, v=(y0 + y1) / 2, width=x1 - x0, height=y1 - y0, coverage=coverage)
+    height, width = flat.shape
+    coverage = np.zeros(len(boxes))
+    for k in range(len(boxes)):
+        x0, y0 = round(max(boxes[k, 0], 0.0)), round(max(boxes[k, 1], 0.0))
+        x1, y1 = round(min(boxes[k, 2], width - 1.0)), round(min(boxes[k, 3], height - 1.0))
+        if min(x1 - x0, y1 - y0) < LEAST_BOX_PX:
+            continue
+        sides = np.zeros(4)
+        sides[0], sides[1] = flat[y0, x0 : x1 + 1].mean(), flat[y1, x0 : x1 + 1].mean()
+        for beside in (-1, 0, 1):
+            left, right = min(max(x0 + beside, 0), width - 1), min(max(x1 + beside, 0), width - 1)
+            sides[2] = max(sides[2], upright[left, y0 : y1 + 1].mean())
+            sides[3] = max(sides[3], upright[right, y0 : y1 + 1].mean())
+        coverage[k] = 0.6 * sides.mean() + 0.4 * sides.min()
+    return coverage

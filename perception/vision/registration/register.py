@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array, Image
+from hal.jit import compiled
 from hal.panel import Panel
 from perception.vision.noise import noise_sigma
 from perception.vision.projection import PanelProjection
@@ -119,7 +120,7 @@ class EdgeImage:
 
 def edge_image(gray: Image) -> EdgeImage:
     """Prepare an image for the edge search; needed once per image for any number of `follow_edges` and `confirmed`."""
-    smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SMOOTHING_SIGMA_PX), np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(gray.astype(np.float32), (5, 5), SMOOTHING_SIGMA_PX), np.float32)
     slope_noise = SLOPE_NOISE * noise_sigma(gray)
     return EdgeImage(smooth=smooth, slope_noise=slope_noise)
 
@@ -162,10 +163,7 @@ def _look(
     smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, window_px: float
 ) -> _Found:
     """Find the strongest image edge along every normal of the model."""
-    points = view.project(edges.points_m)
-    ahead = view.project(
-        edges.points_m + NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
-    )
+    points, ahead = _with_ahead(view, edges)
     normals = ahead - points
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(length > 0, length, 1.0)
@@ -176,8 +174,17 @@ def _look(
 
 def _ahead(view: PanelProjection, edges: Outline) -> Array:
     """Return the displacement in the image (N, 2), px, for a step of `NORMAL_STEP_M` along every normal."""
-    step = NORMAL_STEP_M * np.column_stack([edges.normals, np.zeros(len(edges.normals))])
-    return view.project(edges.points_m + step) - view.project(edges.points_m)
+    points, ahead = _with_ahead(view, edges)
+    return ahead - points
+
+
+def _with_ahead(view: PanelProjection, edges: Outline) -> tuple[Array, Array]:
+    """Return the samples of an outline in the image, and the points `NORMAL_STEP_M` ahead of them, (N, 2) px each."""
+    count = len(edges.points_m)
+    both_m = np.concatenate([edges.points_m, edges.points_m])
+    both_m[count:, :2] += NORMAL_STEP_M * edges.normals
+    both_px = view.project(both_m)
+    return both_px[:count], both_px[count:]
 
 
 def _step(
@@ -195,14 +202,36 @@ def _step(
         found = _look(smooth, slope_noise, view, edges, window_px)
         if found.ok.sum() < len(delta):
             return delta, np.diag(sigma**2)
-        n = found.normals_px[found.ok]
-        J = (motion[found.ok] * n[:, :, None]).sum(axis=1)
-        r = found.offset_px[found.ok]
-        scale = max(1.4826 * float(np.median(np.abs(r))), MEASUREMENT_SIGMA_PX)
-        w = 1.0 / (1.0 + (r / (1.5 * scale)) ** 2) / scale**2
-        N = J.T @ (w[:, None] * J) + information
-        delta = delta + np.linalg.solve(N, J.T @ (w * r) - information @ delta)
+        N, g = _normal_equations(motion, found.normals_px, found.offset_px, found.ok)
+        N += information
+        delta = delta + np.linalg.solve(N, g - information @ delta)
     return delta, np.asarray(np.linalg.inv(N), float)
+
+
+@compiled
+def _spread(residuals: Array) -> float:
+    """Return the standard deviation of residuals about zero, by the median of their magnitudes."""
+    return float(1.4826 * np.median(np.abs(residuals)))
+
+
+@compiled
+def _normal_equations(motion: Array, normals_px: Array, offset_px: Array, ok: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return J^T W J and J^T W r of the edges found, with Cauchy weights W.
+
+    J is the motion (N, 2, P) along the normals (N, 2), and r is the offset (N,) found there.
+    """
+    r = offset_px[ok]
+    scale = max(_spread(r), MEASUREMENT_SIGMA_PX)
+    count = motion.shape[2]
+    N, g = np.zeros((count, count)), np.zeros(count)
+    for k in np.flatnonzero(ok):
+        weight = 1.0 / (1.0 + (offset_px[k] / (1.5 * scale)) ** 2) / scale**2
+        along = motion[k, 0] * normals_px[k, 0] + motion[k, 1] * normals_px[k, 1]
+        for i in range(count):
+            g[i] += weight * along[i] * offset_px[k]
+            for j in range(count):
+                N[i, j] += weight * along[i] * along[j]
+    return N, g
 
 
 def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
@@ -237,7 +266,7 @@ def fit_object(image: EdgeImage, view: PanelProjection, edges: Outline, built_m:
     solution, N = np.array([0.0, 0.0, float(np.median(r))]), prior
     for _ in range(4):
         e = r - J @ solution
-        scale = max(1.4826 * float(np.median(np.abs(e))), 0.3)
+        scale = max(_spread(e), 0.3)
         w = 1.0 / (1.0 + (e / (1.5 * scale)) ** 2) / scale**2 / 2.0  # neighbouring samples share their noise
         N = J.T @ (w[:, None] * J) + prior
         solution = np.linalg.solve(N, J.T @ (w * r))

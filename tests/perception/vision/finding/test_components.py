@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from perception.vision.finding.circles import CIRCLE_SAMPLES, NORMALS, _covered, circle_coverage, find_circles
-from perception.vision.finding.components import components
-from perception.vision.finding.shapes import find_edges
+from perception.vision.finding.components import bridged, components, runs_of
+from perception.vision.finding.shapes import distinct, find_edges
 from perception.vision.noise import noise_sigma
 
 
@@ -28,6 +32,25 @@ def test_parts_are_those_of_opencv(diagonal: bool, share: float) -> None:
 
 def test_an_empty_mask_has_no_parts() -> None:
     assert components(np.zeros((5, 7), np.uint8), diagonal=True).shape == (0, 6)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 6))
+def test_gaps_are_bridged_and_short_runs_left_out(seed: int, gap_px: int, least_px: int) -> None:
+    mask = (np.random.default_rng(seed).random((6, 40)) < 0.4).astype(np.uint8)
+    wanted = []
+    for row, pixels in enumerate(mask):
+        filled = re.sub(rf"(?<=1)0{{1,{gap_px}}}(?=1)", lambda gap: "1" * len(gap[0]), "".join(map(str, pixels)))
+        wanted += [(run.start(), run.end() - 1, row) for run in re.finditer("1+", filled) if len(run[0]) >= least_px]
+    assert list(zip(*bridged(runs_of(mask), gap_px, least_px).tolist(), strict=True)) == wanted
+
+
+def test_rows_that_nearly_equal_an_earlier_one_are_left_out() -> None:
+    random = np.random.default_rng(4)
+    values, apart = random.uniform(0, 12, (300, 3)), np.array([2.0, 2.0, 4.0])
+    kept = distinct(values, apart)
+    close = (np.abs(values[:, None] - values[kept][None]) < apart).all(axis=2)
+    assert close.any(axis=1).all(), "each is near one that is kept"
+    assert close[kept].sum() == len(kept), "and those are not near each other"
 
 
 def disc(u: float, v: float, radius: float) -> np.ndarray:

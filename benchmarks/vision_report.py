@@ -228,7 +228,7 @@ def _speed(folder: Path) -> None:
     regions = _best([partial(grow_regions, g) for g in pictures], 6)
     _line("segmentation with sums, blurs", [regions / blur], (30,), at_most=True)
     overview = _best([partial(_quiet, partial(recognise, g, knowledge)) for g in pictures], 3)
-    _line("blind overview, blurs", [overview / blur], (400,), at_most=True)
+    _line("blind overview, blurs", [overview / blur], (200,), at_most=True)
     panel = shipped_panel()
     intrinsics = camera(1280, 960, focal_px=1200.0)
     pose = certain(RigidTransform.from_matrix(looking_at(distance_m=0.62)))

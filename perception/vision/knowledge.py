@@ -36,6 +36,8 @@ class TaughtKind:
         middles_m: (N, 2) offset from the place with that look to the object's middle, x right, y up; None if all are
         zero.
         noisy: (N,) which looks count in noisy images only; None if none do.
+        reach_m: (N,) distance from the middle beyond which the numbers of a look do not count, because other things are
+        there; infinite if all count, and None if they do in every look.
     """
 
     name: str
@@ -44,6 +46,7 @@ class TaughtKind:
     taught_by: str = ""
     middles_m: Array | None = None
     noisy: NDArray[np.bool_] | None = None
+    reach_m: Array | None = None
 
     @property
     def lasting(self) -> TaughtKind:
@@ -52,23 +55,19 @@ class TaughtKind:
 
     def of(self, rows: NDArray[Any]) -> TaughtKind:
         """Return the kind with only the given rows of its looks."""
-        middles_m = None if self.middles_m is None else self.middles_m[rows]
-        noisy = None if self.noisy is None else self.noisy[rows]
-        return replace(self, looks=self.looks[rows], middles_m=middles_m, noisy=noisy)
+        middles_m, noisy, reach_m = (
+            None if one is None else one[rows] for one in (self.middles_m, self.noisy, self.reach_m)
+        )
+        return replace(self, looks=self.looks[rows], middles_m=middles_m, noisy=noisy, reach_m=reach_m)
 
     def joined(self, other: TaughtKind) -> TaughtKind:
         """Return the kind with another one's looks appended to its own."""
-        middles_m = None
-        if self.middles_m is not None or other.middles_m is not None:
-            middles_m = np.vstack(
-                [np.zeros((len(k.looks), 2)) if k.middles_m is None else k.middles_m for k in (self, other)]
-            )
-        noisy = None
-        if self.noisy is not None or other.noisy is not None:
-            noisy = np.concatenate(
-                [np.zeros(len(k.looks), bool) if k.noisy is None else k.noisy for k in (self, other)]
-            )
-        return replace(self, looks=np.vstack([self.looks, other.looks]), middles_m=middles_m, noisy=noisy)
+        counts = len(self.looks), len(other.looks)
+        middles_m = _joined(self.middles_m, other.middles_m, *(np.zeros((n, 2)) for n in counts))
+        noisy = _joined(self.noisy, other.noisy, *(np.zeros(n, bool) for n in counts))
+        reach_m = _joined(self.reach_m, other.reach_m, *(np.full(n, np.inf) for n in counts))
+        looks = np.vstack([self.looks, other.looks])
+        return replace(self, looks=looks, middles_m=middles_m, noisy=noisy, reach_m=reach_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,10 +95,6 @@ class Knowledge:
         """Return the kind with that name, or None."""
         return next((kind for kind in self.kinds if kind.name == name), None)
 
-    def with_look(self, name: str, size_m: tuple[float, float], look: Array, *, taught_by: str = "") -> Knowledge:
-        """Return the knowledge with one more look; a new name adds a kind."""
-        return self.grown(TaughtKind(name=name, size_m=size_m, looks=look[None], taught_by=taught_by))
-
     def grown(self, more: TaughtKind) -> Knowledge:
         """Return the knowledge with further looks of a kind, which may be new."""
         known = self.kind(more.name)
@@ -118,6 +113,15 @@ class Knowledge:
             seen = set() if known is None else {look.tobytes() for look in known.looks}
             grown = grown.grown(kind.of(np.array([look.tobytes() not in seen for look in kind.looks])))
         return grown
+
+
+def _joined(
+    one: NDArray[Any] | None, other: NDArray[Any] | None, plain: NDArray[Any], plain_of_other: NDArray[Any]
+) -> NDArray[Any] | None:
+    """Return the rows of two kinds as one array, with plain rows for what is None; None if both are."""
+    if one is None and other is None:
+        return None
+    return np.concatenate([plain if one is None else one, plain_of_other if other is None else other])
 
 
 @lru_cache(maxsize=8)

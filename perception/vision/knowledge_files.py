@@ -20,7 +20,7 @@ from hal.panel.kinds import home_of, installed_kinds
 from hal.strict import Strict, load_toml
 from hal.toml_text import toml_text
 from perception.vision.knowledge import Knowledge, TaughtKind, spread_of
-from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
+from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LEAST_REACH_M, LENGTH, RADII_M, RINGS
 
 FOLDER = "knowledge"
 SHIPPED = Path(__file__).parent / FOLDER
@@ -41,7 +41,8 @@ class LookRecord(Strict):
     of the object or its label is more distinct than its middle.
 
     `gray_around` and `edge_around` have one row per direction, clockwise from straight up; if they are absent, all
-    directions have the values of `gray` and `edge`. `noisy`: the look counts in noisy images only.
+    directions have the values of `gray` and `edge`. `noisy`: the look counts in noisy images only. `reach_m`: numbers of
+    larger circles do not count, because neighbours are there; absent if all count.
     """
 
     gray: Row
@@ -52,6 +53,7 @@ class LookRecord(Strict):
     edge_around: Around | None = None
     middle_m: tuple[float, float] = (0.0, 0.0)
     noisy: bool = False
+    reach_m: Annotated[float, Field(ge=LEAST_REACH_M, le=1.0)] | None = None
 
     @property
     def look(self) -> Array:
@@ -149,7 +151,7 @@ def kind_text(kind: TaughtKind) -> str:
 
 
 def write_generated_kind(kind: TaughtKind, folder: Path) -> Path:
-    """Write one kind as a numpy archive and return its path."""
+    """Write one kind as a numpy archive and return its path; an archive has no reach, generated looks count everywhere."""
     path = folder / f"{kind.name}.npz"
     count = len(kind.looks)
     np.savez_compressed(
@@ -210,6 +212,8 @@ def _looks_text(kind: TaughtKind) -> str:
             lines.append("middle_m = [{:.4f}, {:.4f}]".format(*kind.middles_m[k]))
         if kind.noisy is not None and kind.noisy[k]:
             lines.append("noisy = true")
+        if kind.reach_m is not None and np.isfinite(kind.reach_m[k]):
+            lines.append(f"reach_m = {kind.reach_m[k]:.4f}")
         rows = look[: len(GROUPS) * len(RADII_M)].reshape(len(GROUPS), -1)
         lines += [f"{name} = {_written(row)}" for name, row in zip(GROUPS, rows, strict=True)]
         tables = look[len(GROUPS) * len(RADII_M) :].reshape(len(AROUND_GROUPS), DIRECTIONS, RINGS)
@@ -222,6 +226,7 @@ def _kind(record: KindRecord) -> TaughtKind:
     """Build the kind of a TOML record."""
     middles_m = np.array([look.middle_m for look in record.looks])
     noisy = np.array([look.noisy for look in record.looks])
+    reach_m = np.array([np.inf if look.reach_m is None else look.reach_m for look in record.looks])
     return TaughtKind(
         name=record.name,
         size_m=(record.width_m, record.height_m),
@@ -229,6 +234,7 @@ def _kind(record: KindRecord) -> TaughtKind:
         taught_by=record.taught_by,
         middles_m=middles_m if middles_m.any() else None,
         noisy=noisy if noisy.any() else None,
+        reach_m=reach_m if np.isfinite(reach_m).any() else None,
     )
 
 

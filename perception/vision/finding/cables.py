@@ -27,6 +27,10 @@ MARGIN = 12  # cells beside the plate, where a cable may run outside the picture
 MOST = 3  # cables that are searched for
 TAKEN = 4  # cells on either side of a cable in which no further one is searched for
 SURE = 0.3  # darkness from which a cable is certain
+AS_BRIGHT, MOST_BRIGHT = (
+    0.85,
+    0.15,
+)  # gray over the plate's from which a cell is as bright, and share of such cells in a cable
 REACH_PX = 18  # half width of the strip along a course in which the width of the cable is measured
 SHIFTS_PX = 6  # largest shift of a course when it is refined
 SIDES_SEEN = 0.85  # a cable ends where this share of its contrast to the sides is lost
@@ -40,18 +44,32 @@ def without_cables(picture: Image, plate_gray: Float32) -> Image:
     whole = (slice(ALONG * cells[1]), slice(ACROSS * cells[0]))  # OpenCV is four times as fast by whole factors
     small, level = (cv2.resize(p[whole], cells, interpolation=cv2.INTER_AREA) for p in (picture, plate_gray))
     dark = _darkness(np.asarray(small, np.float32), np.asarray(level, np.float32) + np.float32(10.0), HALVES)
+    shade = np.asarray(small / (level + np.float32(1.0)), np.float32)
     gain = np.pad(dark - np.float32(EVEN), ((0, 0), (MARGIN, MARGIN)))
     out = picture
     for _ in range(MOST):
         course, total = _course(gain, BEND)
         if total < LEAST * len(gain):
             break
-        middle = _middle(out, plate_gray, course - MARGIN, dark)
+        middle = _middle(out, plate_gray, course - MARGIN, dark) if _hides_plate(course - MARGIN, dark, shade) else None
         if middle is not None:
             out = _bridged(out, *middle)
         for row, at in enumerate(course):
             gain[row, max(at - TAKEN, MARGIN) : min(at + TAKEN + 1, MARGIN + cells[0])] = -EVEN
     return out
+
+
+def _hides_plate(course: NDArray[np.int64], dark: Float32, shade: Float32) -> bool:
+    """Return whether hardly any cell of a course, between its first and last sure one, is as bright as the plate.
+
+    Between dark things in a row, such as labels or buttons, the plate shows. `shade`: gray over that of the plate.
+    """
+    rows = np.flatnonzero((course >= 0) & (course < dark.shape[1]))
+    sure = np.flatnonzero(dark[rows, course[rows]] > SURE)
+    if not len(sure):
+        return False
+    along = rows[sure[0] : sure[-1] + 1]
+    return bool(np.mean(shade[along, course[along]] > AS_BRIGHT) < MOST_BRIGHT)
 
 
 def _middle(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hal.arrays import Array
 from hal.jit import compiled, inlined
 from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind
+from perception.vision.look import numbers_within
 
 # Median increase of the distance from one nearest look of a kind to the next, in hard synthetic overviews.
 NEXT_FURTHER = 0.02
@@ -24,34 +25,44 @@ class Prepared:
     Attributes:
         columns: (LENGTH, M), one column per look, ordered by kind, so that the same number of all looks is contiguous.
         first: (kinds + 1,) first column of every kind, and the end of the last one.
-        gain: (LENGTH,) factors by which looks are multiplied before they are compared.
-        weights: (LENGTH,) of the numbers.
+        parts: (G + 1,) first column of every part of the columns whose looks have the same reach, and the end.
+        gain: (G, LENGTH) factors by which looks are multiplied before they are compared with a part.
+        most: (G, LENGTH) what each number adds to a distance at most.
     """
 
     columns: NDArray[np.float32]
     first: NDArray[np.int64]
-    gain: Array
-    weights: Array
+    parts: NDArray[np.int64]
+    gain: NDArray[np.float32]
+    most: NDArray[np.float32]
 
 
 @lru_cache(maxsize=4)
 def prepared(knowledge: Knowledge) -> Prepared:
     """Prepare the taught features of all kinds for `nearest`; the result is cached per knowledge."""
     counts = [len(kind.looks) for kind in knowledge.kinds]
-    gain = knowledge.weights / knowledge.spread
-    scaled = np.vstack([kind.looks for kind in knowledge.kinds]) * gain
+    reach_m = np.concatenate(
+        [np.full(len(k.looks), np.inf) if k.reach_m is None else k.reach_m for k in knowledge.kinds]
+    )
+    parts = np.concatenate([[0], np.flatnonzero(reach_m[1:] != reach_m[:-1]) + 1, [len(reach_m)]])
+    weights = knowledge.weights * [numbers_within(reach) for reach in reach_m[parts[:-1]]]
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    gain = weights / knowledge.spread
+    scaled = np.vstack([kind.looks for kind in knowledge.kinds]) * np.repeat(gain, np.diff(parts), axis=0)
     return Prepared(
         columns=np.ascontiguousarray(scaled.T, np.float32),
         first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        gain=gain,
-        weights=knowledge.weights,
+        parts=parts.astype(np.int64),
+        gain=gain.astype(np.float32),
+        most=(CLIP * weights).astype(np.float32),
     )
 
 
 def distances(looks: Array, knowledge: Knowledge) -> Array:
     """Return the distance (N, kinds) of features (N, LENGTH) to the nearest taught example of every kind.
 
-    The distance is the weighted mean of the absolute differences over the spread, each limited to `CLIP`.
+    The distance is the weighted mean of the absolute differences over the spread, each limited to `CLIP`; numbers beyond
+    the reach of a taught example do not count.
     """
     return nearest(looks, prepared(knowledge))
 
@@ -73,11 +84,8 @@ def nearest_of(looks: Array, known: Prepared, kinds: NDArray[np.int64]) -> Array
 
 def _measured(looks: Array, known: Prepared, kinds: NDArray[np.int64], mean_of: int) -> Array:
     """Return the distances of each look to the kinds from `kinds[:, 0]` up to `kinds[:, 1]`, as many for each look."""
-    scaled = (looks * known.gain).astype(np.float32)
-    clips = (CLIP * known.weights).astype(np.float32)
-    total = float(known.weights.sum())
-    found = _nearest(scaled, known.columns, known.first, kinds, clips, mean_of, NEXT_FURTHER * total)
-    return np.asarray(found, float) / total
+    columns = known.columns, known.first, known.parts, known.gain, known.most
+    return np.asarray(_nearest(looks.astype(np.float32), *columns, kinds, mean_of), float)
 
 
 def nearest_look(look: Array, kind: TaughtKind, knowledge: Knowledge) -> int:
@@ -94,15 +102,10 @@ def nothing_column(knowledge: Knowledge) -> int | None:
 
 @compiled
 def _nearest(
-    looks: NDArray[np.float32],
-    columns: NDArray[np.float32],
-    first: NDArray[np.int64],
-    kinds: NDArray[np.int64],
-    clips: NDArray[np.float32],
-    mean_of: int,
-    step: float,
-) -> NDArray[np.float32]:
-    """Compute the distances of every place to the nearest looks of every kind, number by number.
+    looks: NDArray[np.float32], columns: NDArray[np.float32], first: NDArray[np.int64], parts: NDArray[np.int64],
+    gain: NDArray[np.float32], most: NDArray[np.float32], kinds: NDArray[np.int64], mean_of: int,
+) -> NDArray[np.float32]:  # fmt: skip
+    """Compute the distances of every place to the nearest looks of the kinds asked for, number by number.
 
     The inner loop is vectorised with an order of summation that does not depend on the processor.
     """
@@ -111,15 +114,20 @@ def _nearest(
     for i in range(n):
         begin, end = first[kinds[i, 0]], first[kinds[i, 1]]
         total = np.zeros(end - begin, np.float32)
-        for j in range(length):
-            number, row, clip = looks[i, j], columns[j, begin:end], clips[j]
-            for k in range(len(total)):
-                d = abs(number - row[k])
-                total[k] += d if d < clip else clip
+        for g in range(len(parts) - 1):
+            a, b = max(parts[g], begin), min(parts[g + 1], end)
+            if a >= b:
+                continue
+            part = total[a - begin : b - begin]
+            for j in range(length):
+                number, row, clip = looks[i, j] * gain[g, j], columns[j, a:b], most[g, j]
+                for k in range(len(part)):
+                    d = abs(number - row[k])
+                    part[k] += d if d < clip else clip
         for c in range(out.shape[1]):
             k = kinds[i, 0] + c
-            part = total[first[k] - begin : first[k + 1] - begin]
-            out[i, c] = part.min() if mean_of == 1 else _mean_of_least(part, mean_of, step)
+            of_kind = total[first[k] - begin : first[k + 1] - begin]
+            out[i, c] = of_kind.min() if mean_of == 1 else _mean_of_least(of_kind, mean_of, NEXT_FURTHER)
     return out
 
 

@@ -71,6 +71,15 @@ def test_a_further_look_keeps_what_a_person_wrote_into_the_file(tmp_path: Path) 
     assert is_same(load_kind(path), more)
 
 
+def test_the_reach_of_a_taught_look_is_kept(tmp_path: Path) -> None:
+    given_kind = replace(kind(), reach_m=np.array([np.inf, 0.0235, 0.008, np.inf]))
+    path = write_kind(given_kind, tmp_path)
+    read = load_kind(path)
+    assert read.reach_m is not None and np.array_equal(read.reach_m, [np.inf, 0.0235, 0.008, np.inf])
+    write_kind(read.joined(kind(1, seed=1)), tmp_path)
+    assert path.read_text().count("reach_m = ") == 2
+
+
 def test_other_looks_replace_the_file(tmp_path: Path) -> None:
     write_kind(kind(3), tmp_path)
     other = kind(2, seed=5)

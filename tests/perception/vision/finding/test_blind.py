@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,12 +13,21 @@ from benchmarks.vision_disturbance import Disturbance
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.vision.finding.blind import chosen, recognise
 from perception.vision.finding.features import PLATE_PX_PER_M, Ground, half_turned, look_at, plate_gray
-from perception.vision.finding.match import CLIP, NEXT_FURTHER, distances, nearest, prepared
+from perception.vision.finding.match import CLIP, NEXT_FURTHER, distances, nearest, nearest_of, prepared
 from perception.vision.finding.plate import TYPICAL_FOCAL, find_plate
 from perception.vision.finding.shapes import find_edges
 from perception.vision.knowledge import NOTHING, Knowledge, TaughtKind, spread_of
 from perception.vision.knowledge_files import load_knowledge, write_kind
-from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
+from perception.vision.look import (
+    AROUND_GROUPS,
+    DIRECTIONS,
+    GROUPS,
+    LENGTH,
+    RADII_M,
+    RINGS,
+    WEIGHTS,
+    numbers_within,
+)
 from perception.vision.projection import CameraProjection, PlateProjection
 from perception.vision.teaching.lesson import check, plate_points, teach
 from tests.perception.vision.bench_panel import panel, scene
@@ -241,6 +251,24 @@ def test_the_fast_match_agrees_with_the_plain_one() -> None:
         for mean_of in (3, 6):  # one kind has only four looks
             plain = distances_reference(looks, known, mean_of=mean_of)
             assert np.allclose(nearest(looks, prepared(known), mean_of=mean_of), plain)
+
+
+def test_numbers_beyond_the_reach_of_a_look_do_not_count() -> None:
+    rng = np.random.default_rng(2)
+    looks = rng.normal(0, 1, (3, LENGTH))
+    reach_m = np.array([0.012, np.inf, 0.03])
+    kind = TaughtKind(name="a", size_m=(0.05, 0.04), looks=looks, reach_m=reach_m)
+    other = TaughtKind(name="b", size_m=(0.05, 0.04), looks=rng.normal(0, 1, (2, LENGTH)))
+    known = Knowledge(kinds=(kind, other, kind.of(np.array([2]))), spread=spread_of((kind, other)))
+    seen = np.where(numbers_within(0.012), looks[0], rng.normal(0, 1, LENGTH))
+    alone = [Knowledge(kinds=(replace(kind.of(np.array([k])), reach_m=None),), spread=known.spread) for k in range(3)]
+    within = [replace(one, weights=WEIGHTS * numbers_within(reach)) for one, reach in zip(alone, reach_m, strict=True)]
+    expected = [float(distances_reference(seen[None], one)[0, 0]) for one in within]
+    assert expected[0] == 0.0
+    assert distances(seen[None], known)[0, [0, 2]] == pytest.approx([0.0, expected[2]], abs=1e-6)
+    assert nearest_of(np.tile(seen, (2, 1)), prepared(known), np.array([2, 0])) == pytest.approx(
+        [expected[2], 0.0], abs=1e-6
+    )
 
 
 def test_looks_of_a_turned_picture_are_the_turned_looks() -> None:

@@ -54,6 +54,14 @@ def test_a_plate_without_cables_is_left_as_it_is() -> None:
     assert without_cables(bare, level()) is bare
 
 
+def test_a_column_of_dark_buttons_is_no_cable() -> None:
+    picture = np.full((450, 600), PLATE_GRAY, np.float32)
+    for top in range(0, 450, 44):
+        cv2.circle(picture, (300, top + 20), 19, 25.0, -1, cv2.LINE_AA)
+    bare = np.asarray(picture, np.uint8)
+    assert without_cables(bare, level()) is bare
+
+
 def test_two_cables_that_cross_are_both_bridged() -> None:
     bare = plate()
     mask = np.zeros(bare.shape, np.uint8)

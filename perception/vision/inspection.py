@@ -135,6 +135,7 @@ def _inspect_one(
     if not (np.isfinite(centre_px).all() and -0.5 <= centre_px[0] < width and -0.5 <= centre_px[1] < height):
         return replace(reading, reason="the object is outside the image: move the camera")
     patch = patch_of(gray if colour is None else colour, gray, view, spec, shift)
+    patch = replace(patch, is_placed=registration.is_framed)
     if patch.inside.mean() < 0.5:
         return replace(reading, reason="most of the object is outside the image: move the camera")
     if _is_bare(patch, noise):

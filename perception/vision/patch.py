@@ -41,6 +41,8 @@ class Patch:
         parallax_px_per_m: (2,) shift in the patch per metre of height.
         growth_per_m: relative magnification per metre of height, the inverse of the camera's distance; 0 for a
         homography.
+        is_placed: whether the object is where the patch shows it but for its building tolerance, because the plate's border
+        was seen.
     """
 
     gray: Image
@@ -52,6 +54,7 @@ class Patch:
     parallax_px_per_m: Array
     growth_per_m: float
     plane_z_m: float
+    is_placed: bool = False
 
     def pixel_of(self, x_m: ArrayLike, y_m: ArrayLike, z_m: ArrayLike | None = None) -> tuple[Array, Array]:
         """Return the patch coordinates (u, v) of object points; `z_m` is the patch's plane by default."""

@@ -33,6 +33,7 @@ MEASUREMENT_SIGMA_PX = 0.5  # least scale of the residuals in the robust weights
 GROWTH_SIGMA_PX = 2.0  # prior standard deviation of an object's growth
 EDGE_BIAS_SIGMA_PX = 0.8  # a printed or real cast shadow shifts a whole outline by about 1 px
 REGISTERED_SIGMA_PX = 0.15  # standard deviation of the panel's registration as a whole
+FRAMED = 0.5  # share of a side of the plate
 MIN_VISIBLE = 16  # with fewer edge samples in the image nothing can be said about the panel
 
 
@@ -48,6 +49,8 @@ class Registration:
         covariance: of its motion parameters.
         support: share of the visible model edges with an image edge within 2 px; NaN if too few are in view.
         rms_px: root mean square offset of these edges.
+        is_framed: whether a horizontal and a vertical side of the plate's border were found, so that the edges of other
+        objects cannot have misled it.
         objects: per object name, the fit to its own edges; only for kinds with edges that every state shows.
     """
 
@@ -55,6 +58,7 @@ class Registration:
     covariance: Array
     support: float
     rms_px: float
+    is_framed: bool
     objects: dict[str, ObjectFit]
 
 
@@ -87,7 +91,8 @@ def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
     image = edge_image(gray)
     smooth, slope_noise = image.smooth, image.slope_noise
     own = {panel_object.name: edges for panel_object in panel.objects if (edges := edges_of(panel_object)) is not None}
-    everything = _joined([plate_edges(panel), *own.values()])
+    border = plate_edges(panel)
+    everything = _joined([border, *own.values()])
     covariance = np.diag(view.prior_sigma**2)
     reference = view
     delta = np.zeros(len(view.prior_sigma))
@@ -106,8 +111,16 @@ def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
         covariance=covariance,
         support=float(near.sum() / found.visible.sum()) if found.visible.sum() >= MIN_VISIBLE else float("nan"),
         rms_px=float(np.sqrt(np.mean(found.offset_px[near] ** 2))) if near.any() else float("nan"),
+        is_framed=_is_framed(found.visible[: len(border.points_m)], near[: len(border.points_m)]),
         objects=local,
     )
+
+
+def _is_framed(visible: NDArray[np.bool_], near: NDArray[np.bool_]) -> bool:
+    """Return whether most of a horizontal and of a vertical side of the border is in view, and edges confirm most of that."""
+    seen, found = (mask.reshape(4, -1).mean(axis=1) for mask in (visible, near))
+    top, right, bottom, left = (seen >= FRAMED) & (found >= FRAMED * seen)
+    return bool((top or bottom) and (left or right))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,6 +19,7 @@ INSIDE_M = 0.0008  # half of the strip along the slot's middle that is averaged;
 BOX_M = 0.0012  # length of the two boxes whose difference is the contrast of an end
 STEP_M = 0.0001
 REACH_M = 0.005  # search to each side of an end; more than an error of the pose
+PLACED_M = 0.0015  # largest shift where the plate's border was seen; what is further is no end of this slot
 LEAST_NOISES, LEAST_SHARE = 4.0, 0.5  # least contrast of an end in sigmas of its noise, and relative to the other end
 # Largest half of the difference between the length of the slot and that of the file, and the same per length.
 UNEQUAL_M, UNEQUAL_SHARE = 0.0007, 0.005
@@ -48,17 +49,19 @@ def track_shift(patch: Patch, spec: Slider, *, cap_m: float) -> TrackShift:
     half_m = (spec.travel_m + spec.cap_size_m[0]) / 2
     room_m = spec.cap_size_m[0] / 2 + abs(patch.growth_per_m) * spec.cap_size_m[2] * half_m + CAP_ROOM_M
     ends = [_end(patch, spec, sign * half_m) for sign in (-1.0, 1.0) if abs(sign * half_m - cap_m) > room_m]
+    most_m = PLACED_M if patch.is_placed else REACH_M + BOX_M
     least = LEAST_NOISES * contrast_noise(patch)
     seen = [(at, contrast) for at, contrast in ends if abs(contrast) >= least]
     if len(seen) == 2:
         (low, low_contrast), (high, high_contrast) = seen
         ratio = low_contrast / high_contrast
         unequal_m = UNEQUAL_M + UNEQUAL_SHARE * half_m
-        if LEAST_SHARE <= ratio <= 1.0 / LEAST_SHARE and abs(high - low) / 2 <= unequal_m:
+        is_slot = LEAST_SHARE <= ratio <= 1.0 / LEAST_SHARE and abs(high - low) / 2 <= unequal_m
+        if is_slot and abs(low + high) / 2 <= most_m:
             return TrackShift(shift_m=(low + high) / 2, sigma_m=BOTH_SIGMA_M)
-    elif len(ends) == 1 and len(seen) == 1:
+    elif len(ends) == 1 and len(seen) == 1 and abs(seen[0][0]) <= most_m:
         return TrackShift(shift_m=seen[0][0], sigma_m=ONE_SIGMA_M)
-    return TrackShift(shift_m=0.0, sigma_m=MISSED_SIGMA_M if ends else NONE_SIGMA_M)
+    return TrackShift(shift_m=0.0, sigma_m=MISSED_SIGMA_M if ends and not patch.is_placed else NONE_SIGMA_M)
 
 
 def _end(patch: Patch, spec: Slider, end_m: float) -> tuple[float, float]:

@@ -14,7 +14,10 @@ from numpy.typing import ArrayLike
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
+from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, perturbed
+
+LEAST_CORNER = 0.05  # sine of the turn at a corner; with less three corners are nearly on one line
 
 
 class PanelProjection(Protocol):
@@ -98,6 +101,31 @@ class PlateProjection:
         return PlateProjection(
             px_from_plate=homography(self.corners_m, shifted), corners_m=self.corners_m, sigma_px=self.sigma_px
         )
+
+
+def plate_by_corners(corners_px: ArrayLike, plate_m: tuple[float, float]) -> PlateProjection:
+    """Return the view of an upright plate of known size whose corners (4, 2) were clicked, in any order.
+
+    Raises:
+        InvalidRequest: the corners are not those of a convex quadrangle.
+    """
+    clicked = np.asarray(corners_px, float)
+    away = clicked - clicked.mean(axis=0)
+    around = clicked[np.argsort(np.arctan2(away[:, 1], away[:, 0]))]  # clockwise in the image, where y points down
+    upper_left = int((around @ [1.0, 1.0]).argmin())
+    corners = np.roll(around, -upper_left, axis=0)
+    sides = np.roll(corners, -1, axis=0) - corners
+    following = np.roll(sides, -1, axis=0)
+    turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
+    lengths = np.linalg.norm(sides, axis=1)
+    if not (turns > LEAST_CORNER * lengths * np.roll(lengths, -1)).all():
+        raise InvalidRequest(
+            "the four corners are not those of a plate: three lie on one line, or one lies between the others",
+            hint="click the four corners of the upright plate, each once",
+        )
+    width, height = plate_m
+    corners_m = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]) * [width / 2, height / 2]
+    return PlateProjection(px_from_plate=homography(corners_m, corners), corners_m=corners_m)
 
 
 def homography(source: Array, target: Array) -> Array:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hal.panel import Question
+    from perception.vision.teaching import Overview
     from service.knowledge.store import KnowledgeStore
 
 MOST_PLATE_M = 10.0
@@ -46,12 +47,21 @@ class Terminal:
 
 
 def teach(
-    image: Annotated[Path, typer.Argument(help="Overview of one upright panel with its whole border in view.")],
+    image: Annotated[
+        Path,
+        typer.Argument(help="Overview of one upright panel with its whole border in view, or with its corners told."),
+    ],
     *,
     folder: Annotated[
         Path, typer.Option(help="Folder for taught kinds and panels, which take precedence over the shipped ones.")
     ] = Path("runs/knowledge"),
     plate: Annotated[str, typer.Option(help="WIDTH,HEIGHT of the plate, m.")] = "0.60,0.40",
+    corner: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="X,Y in pixels of a corner of the plate, four times, in any order; without them its border is looked for."
+        ),
+    ] = None,
     kind: Annotated[str | None, typer.Option(help="Kind of the clicked object; a new name makes a new kind.")] = None,
     click: Annotated[
         list[str] | None,
@@ -74,56 +84,83 @@ def teach(
     """
     from service.knowledge.store import KnowledgeStore
 
-    plate_m = _pair(plate, "--plate")
-    if min(plate_m) <= 0 or max(plate_m) > MOST_PLATE_M:
-        raise InvalidRequest(f"no plate is {plate} m", hint="for example --plate 0.60,0.40")
-    ways = (check, kind is not None, dialogue, from_panel is not None)
-    if sum(ways) > 1:
-        raise InvalidRequest("give one of --kind, --from-panel, --check and --dialogue", hint="teach first, then check")
+    plate_m = _size(plate)
     pixels = read_image(image)
-    if not (any(ways) or sys.stdin.isatty()):
-        raise InvalidRequest(
-            "there is no terminal for the dialogue",
-            hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin",
-        )
+    _check_way(check, kind is not None, dialogue, from_panel is not None)
     compile_first()
     store = KnowledgeStore(folder)
-    if kind is not None:
-        _by_clicks(store, pixels, plate_m, kind=kind, clicks=click or [])
-        return
+    corners_px = _corners(corner)
     if from_panel is not None:
-        _by_panel(store, pixels, from_panel)
+        _by_panel(store, pixels, from_panel, corners_px)
+        return
+    from perception.vision.teaching import overview_of
+
+    overview = overview_of(pixels, plate_m=plate_m, corners_px=corners_px)
+    if kind is not None:
+        _by_clicks(store, overview, kind=kind, clicks=click or [])
         return
     from service.knowledge.dialogue import Dialogue
 
-    talk = Dialogue.about(Terminal(), store, pixels, plate_m)
+    talk = Dialogue(talk=Terminal(), store=store, pixels=pixels, overview=overview)
     if check:
         talk.show_found()
     else:
         talk.run()
 
 
-def _by_clicks(
-    store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float], *, kind: str, clicks: list[str]
-) -> None:
+def _check_way(*ways: bool) -> None:
+    """Check that one way of teaching is given, or that a person can be asked."""
+    if sum(ways) > 1:
+        raise InvalidRequest("give one of --kind, --from-panel, --check and --dialogue", hint="teach first, then check")
+    if not (any(ways) or sys.stdin.isatty()):
+        raise InvalidRequest(
+            "there is no terminal for the dialogue",
+            hint="give --kind, --from-panel, --check, or --dialogue with answers on stdin",
+        )
+
+
+def _size(plate: str) -> tuple[float, float]:
+    """Return the size of the plate, m."""
+    plate_m = _pair(plate, "--plate")
+    if min(plate_m) <= 0 or max(plate_m) > MOST_PLATE_M:
+        raise InvalidRequest(f"no plate is {plate} m", hint="for example --plate 0.60,0.40")
+    return plate_m
+
+
+def _corners(corners: list[str] | None) -> tuple[tuple[float, float], ...] | None:
+    """Return the corners of the plate, px; None if none is given."""
+    if not corners:
+        return None
+    if len(corners) != 4:
+        raise InvalidRequest(
+            f"a plate has four corners, not {len(corners)}", hint="give --corner X,Y four times, or leave it out"
+        )
+    return tuple(_pair(text, "--corner") for text in corners)
+
+
+def _by_clicks(store: KnowledgeStore, overview: Overview, *, kind: str, clicks: list[str]) -> None:
     from service.knowledge.teach import teach_kind
 
-    clicks_px = tuple(_pair(text, "--click") for text in clicks)
-    taught = teach_kind(store, pixels, plate_m, kind=kind, clicks_px=clicks_px)
+    taught = teach_kind(store, overview, kind=kind, clicks_px=tuple(_pair(text, "--click") for text in clicks))
     if not taught.added:
         console.print(f"this look of {kind} is known already; nothing was written", markup=False)
         return
     console.print(f"wrote {taught.path}", markup=False)
 
 
-def _by_panel(store: KnowledgeStore, pixels: NDArray[np.uint8], panel_file: Path) -> None:
+def _by_panel(
+    store: KnowledgeStore,
+    pixels: NDArray[np.uint8],
+    panel_file: Path,
+    corners_px: tuple[tuple[float, float], ...] | None,
+) -> None:
     from hal.panel import load_panel
     from perception.vision import as_gray, check_upright, one_plate
     from service.commands.learn import tell
     from service.knowledge.teach import learn_panel
 
     panel, gray = load_panel(panel_file), as_gray(pixels)
-    view = one_plate(gray, (panel.width_m, panel.height_m)).view
+    view = one_plate(gray, (panel.width_m, panel.height_m), corners_px=corners_px).view
     check_upright(gray, view, panel)
     learned = learn_panel(store, pixels, view, panel)
     tell(learned.result())

@@ -24,7 +24,6 @@ from perception.vision.teaching import (
     kind_question,
     likest,
     object_row,
-    overview_of,
     panel_text,
     questions,
     teach_example,
@@ -74,18 +73,6 @@ class Dialogue:
     store: KnowledgeStore
     pixels: NDArray[np.uint8]
     overview: Overview
-
-    @classmethod
-    def about(
-        cls, talk: Talk, store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float]
-    ) -> Dialogue:
-        """Start a dialogue about an image.
-
-        Raises:
-            InvalidRequest, NotObservable, NotFound, Ambiguous: the image shows no panel to teach from.
-        """
-        overview = overview_of(pixels, plate_m=plate_m)
-        return cls(talk=talk, store=store, pixels=pixels, overview=overview)
 
     def run(self) -> None:
         """Ask the questions, teach, and show what is found afterwards."""
@@ -198,7 +185,7 @@ class Dialogue:
     def show_found(self) -> None:
         """Show what is found in the image with the present knowledge."""
         lines = []
-        for found in check(self.pixels, self.store.knowledge(), plate_m=self.overview.plate_m):
+        for found in check(self.pixels, self.store.knowledge(), plate_m=self.overview.plate_m, view=self.overview.view):
             x, y = found.centre_px
             verdict = f"refused: {found.reason}" if found.reason else f"confidence {found.confidence:.2f}"
             lines.append(f"{found.kind} at {x:.0f},{y:.0f} px  {verdict}")

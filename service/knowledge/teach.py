@@ -13,7 +13,7 @@ from hal.panel import Panel, Question
 from hal.strict import Strict
 from service.knowledge.images import ImageStore
 from service.knowledge.store import KnowledgeStore, check_name
-from service.schema.requests import ImageId, ObjectName, PlateSize
+from service.schema.requests import ImageId, ObjectName, Pixel, PlateCorners, PlateSize
 from service.schema.results import LearnResult, Numbers, Result, Rows
 
 if TYPE_CHECKING:
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from perception.vision import PanelProjection
     from perception.vision.teaching import Example, Overview, PanelLooks
 
-PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
-Click = tuple[PixelNumber, PixelNumber]
-Clicks = Annotated[tuple[Click, ...], Field(min_length=1, max_length=3)]
+Clicks = Annotated[tuple[Pixel, ...], Field(min_length=1, max_length=3)]
 PlainName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
 Answer = Annotated[str, Field(max_length=400)]
 
@@ -35,6 +33,7 @@ class OutlineRequest(Strict):
 
     image: ImageId
     plate_m: Annotated[PlateSize, Field(description="width and height of the panel's plate")]
+    corners_px: PlateCorners | None = None
     clicks_px: Clicks
 
 
@@ -52,7 +51,7 @@ class PanelLesson(Strict):
 
     name: PlainName
     objects: Annotated[tuple[ObjectLesson, ...], Field(min_length=1, max_length=100)]
-    lights_px: Annotated[tuple[Click, ...], Field(max_length=4)] = ()
+    lights_px: Annotated[tuple[Pixel, ...], Field(max_length=4)] = ()
 
 
 class TeachRequest(Strict):
@@ -60,8 +59,9 @@ class TeachRequest(Strict):
 
     image: ImageId
     plate_m: Annotated[PlateSize, Field(description="width and height of the panel's plate")]
+    corners_px: PlateCorners | None = None
     kind: Annotated[PlainName | None, Field(description="a new name makes a new kind")] = None
-    clicks_px: Annotated[tuple[Click, ...], Field(max_length=3)] = ()
+    clicks_px: Annotated[tuple[Pixel, ...], Field(max_length=3)] = ()
     size_m: Annotated[PlateSize | None, Field(description="size of the kind; if null, the size of the outline")] = None
     panel: PanelLesson | None = None
 
@@ -117,7 +117,7 @@ def find_outline(images: ImageStore, store: KnowledgeStore, request: OutlineRequ
     """
     from perception.vision.teaching import example_at, overview_of
 
-    overview = overview_of(images.pixels(request.image), plate_m=request.plate_m)
+    overview = overview_of(images.pixels(request.image), plate_m=request.plate_m, corners_px=request.corners_px)
     return described(overview, example_at(overview, request.clicks_px), store)
 
 
@@ -128,28 +128,26 @@ def teach(images: ImageStore, store: KnowledgeStore, request: TeachRequest) -> T
         PerceptionError: as for `find_outline`; `Ambiguous` also when the lesson would make another kind worse.
         ConfigError: the answers do not make a valid panel.
     """
-    pixels = images.pixels(request.image)
+    from perception.vision.teaching import overview_of
+
+    overview = overview_of(images.pixels(request.image), plate_m=request.plate_m, corners_px=request.corners_px)
     if request.panel is not None:
-        return teach_panel(store, pixels, request.plate_m, request.panel)
-    return teach_kind(
-        store, pixels, request.plate_m, kind=request.kind or "", clicks_px=request.clicks_px, size_m=request.size_m
-    )
+        return teach_panel(store, overview, request.panel)
+    return teach_kind(store, overview, kind=request.kind or "", clicks_px=request.clicks_px, size_m=request.size_m)
 
 
 def teach_kind(
     store: KnowledgeStore,
-    pixels: NDArray[np.uint8],
-    plate_m: tuple[float, float],
+    overview: Overview,
     *,
     kind: str,
-    clicks_px: tuple[Click, ...],
+    clicks_px: tuple[Pixel, ...],
     size_m: tuple[float, float] | None = None,
 ) -> TaughtView:
     """Teach one example of a kind and store it; see `teach`."""
-    from perception.vision.teaching import example_at, overview_of
+    from perception.vision.teaching import example_at
 
     check_name(kind)
-    overview = overview_of(pixels, plate_m=plate_m)
     example = example_at(overview, clicks_px, kind=kind)
     taught = _stored(store, example, kind=kind, size_m=size_m, source="panelwright teach")
     return (
@@ -189,14 +187,11 @@ def _stored(
     )
 
 
-def teach_panel(
-    store: KnowledgeStore, pixels: NDArray[np.uint8], plate_m: tuple[float, float], lesson: PanelLesson
-) -> TaughtView:
+def teach_panel(store: KnowledgeStore, overview: Overview, lesson: PanelLesson) -> TaughtView:
     """Write a whole panel's file from clicks and answers; see `teach`."""
-    from perception.vision.teaching import PanelObjectDraft, example_at, find_border_lights, overview_of, panel_text
+    from perception.vision.teaching import PanelObjectDraft, example_at, find_border_lights, panel_text
 
     check_name(lesson.name)
-    overview = overview_of(pixels, plate_m=plate_m)
     lights = find_border_lights(overview, lesson.lights_px)
     drafts = [
         PanelObjectDraft(

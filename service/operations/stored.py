@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Pixels = NDArray[np.uint8]
 PICTURE_WIDTH_PX = 1600  # wider pictures are reduced to this width for display
 BORDER_SIGMA_PX = 1.0  # of a corner of the plate where two of its sides meet
+CLICK_SIGMA_PX = 3.0  # of one that a person clicked
 
 
 def read_stored(session: Session, request: RecogniseRequest | InspectRequest) -> InspectResult:
@@ -54,7 +55,7 @@ def read_stored(session: Session, request: RecogniseRequest | InspectRequest) ->
 
 def blind_in_stored(session: Session, request: RecogniseRequest) -> RecogniseResult:
     """Find kinds of objects and their places in a stored image; errors as for `read_stored`."""
-    from perception.vision import as_gray
+    from perception.vision import as_gray, one_plate
 
     pixels = _stores(session)[0].pixels(request.image or "")
     plate_m = request.plate_m
@@ -64,16 +65,22 @@ def blind_in_stored(session: Session, request: RecogniseRequest) -> RecogniseRes
     gray = as_gray(pixels)
     lens = _lens(session, request, gray)
     focal_px = lens.fx_px if lens is not None else None
-    return blind_answer(session, pixels, plate_m, focal_px=focal_px)
+    view = None if request.corners_px is None else one_plate(gray, plate_m, corners_px=request.corners_px).view
+    return blind_answer(session, pixels, plate_m, focal_px=focal_px, view=view)
 
 
 def blind_answer(
-    session: Session, pixels: Pixels, plate_m: tuple[float, float], *, focal_px: float | None
+    session: Session,
+    pixels: Pixels,
+    plate_m: tuple[float, float],
+    *,
+    focal_px: float | None,
+    view: PanelProjection | None = None,
 ) -> RecogniseResult:
     """Return all candidates, the refused ones with their reasons, and a picture of the others."""
     from perception.vision import draw_outlines, recognise
 
-    found = recognise(pixels, knowledge_of(session), plate_m=plate_m, focal_px=focal_px)
+    found = recognise(pixels, knowledge_of(session), plate_m=plate_m, focal_px=focal_px, view=view)
     taken = [candidate for candidate in found if candidate.reason is None]
     texts = [f"{candidate.kind} {candidate.confidence:.2f}" for candidate in taken]
     outlined = draw_outlines(pixels, [candidate.box_px for candidate in taken], texts, [True] * len(taken))
@@ -150,18 +157,20 @@ def stored_view(session: Session, request: StoredLook, panel: Panel) -> tuple[Pi
 
 
 def _view(session: Session, request: StoredLook, gray: Pixels, panel: Panel) -> PanelProjection:
-    """Return the panel's place: the caller's, or found by the panel's border, through the lens if it is known."""
+    """Return the panel's place: the caller's, or by the panel's border, through the lens if it is known."""
     from perception.vision import CameraProjection, estimate, one_plate
 
     lens = _lens(session, request, gray)
     if lens is not None and request.camera_from_panel is not None:
         return CameraProjection(intrinsics=lens, camera_from_panel=request.camera_from_panel.pose())
     plate_m = request.plate_m or (panel.width_m, panel.height_m)
-    plate = one_plate(gray, plate_m, focal_px=lens.fx_px if lens is not None else None)
+    focal_px = lens.fx_px if lens is not None else None
+    view = one_plate(gray, plate_m, focal_px=focal_px, corners_px=request.corners_px).view
     if lens is None:
-        return plate.view
-    corners_m = np.column_stack([plate.view.corners_m, np.zeros(4)])
-    pose = estimate(corners_m, plate.view.project(corners_m), BORDER_SIGMA_PX**2, lens)
+        return view
+    sigma_px = BORDER_SIGMA_PX if request.corners_px is None else CLICK_SIGMA_PX
+    corners_m = np.column_stack([view.corners_m, np.zeros(4)])
+    pose = estimate(corners_m, view.project(corners_m), sigma_px**2, lens)
     return CameraProjection(
         intrinsics=lens,
         camera_from_panel=UncertainPose(parent_from_child=pose.camera_from_object, covariance=pose.covariance),

@@ -38,6 +38,16 @@ LeastConfidence = Annotated[
         examples=[0.0, 0.9],
     ),
 ]
+PixelNumber = Annotated[float, Field(ge=-1e5, le=1e5)]
+Pixel = tuple[PixelNumber, PixelNumber]
+PlateCorners = Annotated[
+    tuple[Pixel, ...],
+    Field(
+        min_length=4,
+        max_length=4,
+        description="corners of the upright plate, in any order; if null, its border is looked for",
+    ),
+]
 ANSWER_AT = 0.5  # the default of the readers
 Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
 
@@ -93,6 +103,7 @@ class StoredLook(Strict):
     plate_m: Annotated[
         PlateSize | None, Field(description="width and height of the plate; if null, those of the panel")
     ] = None
+    corners_px: PlateCorners | None = None
     camera: Annotated[
         ObjectName | None, Field(description="camera that takes the image, or that took the stored one")
     ] = None
@@ -103,8 +114,12 @@ class StoredLook(Strict):
 
     @model_validator(mode="after")
     def _is_of_one_kind(self) -> StoredLook:
-        if self.image is None and (self.panel or self.plate_m or self.lens or self.camera_from_panel):
-            raise ValueError("panel, plate_m, lens and camera_from_panel need a stored `image`")
+        if self.image is None and (
+            self.panel or self.plate_m or self.corners_px or self.lens or self.camera_from_panel
+        ):
+            raise ValueError("panel, plate_m, corners_px, lens and camera_from_panel need a stored `image`")
+        if self.corners_px is not None and self.camera_from_panel is not None:
+            raise ValueError("corners_px and camera_from_panel both say where the panel is: give one")
         if self.lens is not None and self.camera is not None:
             raise ValueError("give a lens or a camera's name, not both")
         if self.camera_from_panel is not None and self.lens is None and self.camera is None:

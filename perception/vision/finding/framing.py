@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from hal.errors import Ambiguous, NotFound
 from hal.geometry import UncertainPose, transform
 from hal.panel import Panel
 from perception.vision.finding.plate import Plate, find_plate
-from perception.vision.projection import CameraProjection, PanelProjection, PlateProjection
+from perception.vision.projection import CameraProjection, PanelProjection, PlateProjection, plate_by_corners
 from perception.vision.registration.register import register
 
 COARSE_WIDTH_PX = 160
@@ -31,13 +31,22 @@ ASKEW: tuple[tuple[str, str, Callable[[Image], Image]], ...] = (
 )
 
 
-def one_plate(gray: Image, plate_m: tuple[float, float], *, focal_px: float | None = None) -> Plate:
-    """Return the plate of the one panel that fills the image.
+def one_plate(
+    gray: Image,
+    plate_m: tuple[float, float],
+    *,
+    focal_px: float | None = None,
+    corners_px: Sequence[tuple[float, float]] | None = None,
+) -> Plate:
+    """Return the plate of the one panel that fills the image, or whose four corners were clicked, in any order.
 
     Raises:
         NotFound: none does.
         Ambiguous: two panels are in view.
+        InvalidRequest: the corners are not those of a convex quadrangle.
     """
+    if corners_px is not None:
+        return Plate(view=plate_by_corners(corners_px, plate_m), sides_seen=(True, True, True, True), is_sure=True)
     if _panels_in(gray, plate_m[0] / plate_m[1]) > 1:
         raise Ambiguous(
             "two panels are in view, and either may be meant",

@@ -141,16 +141,16 @@ def teach(
 
 def overview_of(
     image: NDArray[Any], *, plate_m: tuple[float, float] = PLATE_M, view: PanelProjection | None = None,
-    focal_px: float | None = None,
+    focal_px: float | None = None, corners_px: Sequence[tuple[float, float]] | None = None,
 ) -> Overview:  # fmt: skip
-    """Rectify the image of one panel for teaching.
+    """Rectify the image of one panel for teaching; its border is looked for if neither view nor corners are known.
 
     Raises:
-        InvalidRequest, NotObservable: bad image.
+        InvalidRequest, NotObservable: bad image, or corners that cannot be.
         NotFound, Ambiguous: no plate in it, or two.
     """
     gray = as_gray(image)
-    view = view or one_plate(gray, plate_m, focal_px=focal_px).view
+    view = view or one_plate(gray, plate_m, focal_px=focal_px, corners_px=corners_px).view
     return Overview(view=view, ground=lay_out(gray, view, plate_m), plate_m=plate_m)
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hal.errors import InvalidRequest
+from hal.errors import InvalidRequest, NotFound
 from hal.panel import load_panel
 from perception.vision.knowledge_files import load_knowledge
 from perception.vision.projection import CameraProjection
@@ -36,6 +36,36 @@ def test_a_new_kind_is_found_after_two_clicks(tmp_path: Path, capsys: pytest.Cap
     teach(tmp_path / "panel.png", folder=folder, check=True)
     found = [line for line in capsys.readouterr().out.splitlines() if "confidence" in line]
     assert sum(line.startswith("mushroom at") for line in found) == 1
+
+
+def test_four_corners_serve_where_the_border_is_not_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image, intrinsics, pose = scene(tilt_deg=5.0, distance_m=0.66, pose_error=0.0)
+    view, size = CameraProjection(intrinsics=intrinsics, camera_from_panel=pose), panel()
+    half_m = np.array([size.width_m, size.height_m, 0.0]) / 2
+    corners_px = view.project(half_m * [[1, 1, 0], [-1, -1, 0], [-1, 1, 0], [1, -1, 0]])
+    clicks_px = view.project(size.object("emergency").point_m + np.array([[-0.02, 0.02, 0.0], [0.02, -0.02, 0.0]]))
+    room = np.full((2 * image.shape[0], 2 * image.shape[1]), 120, np.uint8)  # the plate fills less than a quarter
+    room[100 : 100 + image.shape[0], 150 : 150 + image.shape[1]] = image
+    cv2.imwrite(str(tmp_path / "room.png"), room)
+    corners, clicks = ([f"{u + 150:.1f},{v + 100:.1f}" for u, v in points] for points in (corners_px, clicks_px))
+    with pytest.raises(NotFound, match="plate"):
+        teach(tmp_path / "room.png", folder=tmp_path / "kinds", kind="mushroom", click=clicks)
+    teach(tmp_path / "room.png", folder=tmp_path / "kinds", kind="mushroom", click=clicks, corner=corners)
+    capsys.readouterr()
+    teach(tmp_path / "room.png", folder=tmp_path / "kinds", check=True, corner=corners)
+    found = [line for line in capsys.readouterr().out.splitlines() if "confidence" in line]
+    assert len(found) >= 0.8 * len(size.objects) and sum(line.startswith("mushroom at") for line in found) == 1
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [["10,10"], ["10,10", "20,20", "30,30", "40,40"], ["0,0", "90,0", "0,90", "20,20"], ["1,1", "a", "2,2", "3,3"]],
+)
+def test_corners_that_cannot_be_are_refused(tmp_path: Path, bad: list[str]) -> None:
+    clicks = _example(tmp_path / "panel.png")
+    with pytest.raises(InvalidRequest, match="corner"):
+        teach(tmp_path / "panel.png", folder=tmp_path / "kinds", kind="mushroom", click=clicks, corner=bad)
+    assert not (tmp_path / "kinds").exists()
 
 
 @pytest.mark.parametrize("bad", [["nan,1"], ["1"], ["1e9,3"], ["a,b"], []])

@@ -64,6 +64,26 @@ def test_a_new_kind_is_taught_listed_found_and_forgotten(web: httpx2.Client, sho
     is_problem(web.delete("/v1/knowledge/kinds/gauge"), 404, "no-such-knowledge", "no taught kind")
 
 
+def test_a_plate_whose_corners_are_told_is_not_looked_for(web: httpx2.Client, shown: Shown) -> None:
+    picture, view = shown
+    room = np.full((2 * picture.shape[0], 2 * picture.shape[1], *picture.shape[2:]), 120, np.uint8)
+    room[100 : 100 + picture.shape[0], 150 : 150 + picture.shape[1]] = picture
+    half_m, off_px = np.array([*PLATE, 0.0]) / 2, np.array([150.0, 100.0])
+    told = view.project(half_m * [[1, 1, 0], [-1, -1, 0], [-1, 1, 0], [1, -1, 0]]) + off_px
+    look = {"image": store(web, room), "plate_m": PLATE}
+    click = {"clicks_px": (np.array(middle(shown, "mode")) + off_px).tolist()}
+    is_problem(web.post("/v1/knowledge/outline", json={**look, **click}), 409, "not-found", "plate")
+    look["corners_px"] = told.tolist()
+    assert web.post("/v1/knowledge/outline", json={**look, **click}).json()["taken_for"] == "rotary"
+    found = web.post("/v1/recognise?wait_s=30", json={**look, "mode": "blind"}).json()["result"]["candidates"]
+    rotaries = [c["centre_px"] for c in found if c["kind"] == "rotary" and c["reason"] is None]
+    assert np.linalg.norm(np.array(rotaries) - click["clicks_px"], axis=1).min() < 10.0
+    refused = web.post(
+        "/v1/knowledge/outline", json={**look, **click, "corners_px": [[0, 0], [9, 9], [20, 20], [30, 30]]}
+    )
+    is_problem(refused, 422, "invalid-request", "corners")
+
+
 def test_a_whole_panel_is_taught_and_read(web: httpx2.Client, shown: Shown, house: Panelwright) -> None:
     image = store(web, shown[0])
     objects = [

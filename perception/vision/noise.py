@@ -9,7 +9,7 @@ from hal.arrays import Image
 from hal.jit import compiled
 
 LEAST_NOISE = 0.3  # gray levels; the effect of rounding
-ENOUGH_PX = 50_000  # number of pixels that is enough for the estimate, which then has an error of half a percent
+ENOUGH_PX = 50_000  # number of pixels that is enough for the estimate, which then has an error of less than one percent
 
 
 def noise_sigma(gray: Image) -> float:

@@ -295,9 +295,8 @@ def _centred(ground: Ground, places: Array, known: Prepared, kinds: NDArray[np.i
     """
     for step in CENTRING_STEPS_PX:
         tried = places[:, None] + step * CROSS
-        d = nearest_of(look_at(ground, tried.reshape(-1, 2)), known, np.repeat(kinds, len(CROSS))).reshape(
-            -1, len(CROSS)
-        )
+        looks = look_at(ground, tried.reshape(-1, 2))
+        d = nearest_of(looks, known, np.repeat(kinds, len(CROSS))).reshape(-1, len(CROSS))
         least, most = d.min(axis=1, keepdims=True), d.max(axis=1, keepdims=True)
         w = np.exp(-(d - least) / np.maximum(0.25 * (most - least), 1e-6))
         places = (w[:, :, None] * tried).sum(axis=1) / w.sum(axis=1, keepdims=True)

@@ -29,6 +29,7 @@ SIDE_MOST_PX = 6  # largest thickness of a side
 SIDES_UNEVEN_PX = 9  # opposite sides end less than this apart
 SLOT_MOST_PX = 12  # largest width of a slot
 LEAST_BOX_PX = 4
+SAME_PX = np.array([3.0, 3.0, 5.0, 5.0])  # differences of middle and size below which two rectangles are one
 LEAST_COVERAGE = 0.55
 
 
@@ -92,11 +93,10 @@ def find_rectangles(maps: DirectionMaps, *, least_px: float, most_px: float) -> 
     boxes, coverage = boxes[coverage >= LEAST_COVERAGE], coverage[coverage >= LEAST_COVERAGE]
     order = np.argsort(-coverage, kind="stable")
     laid = np.hstack([boxes[order, :2] + boxes[order, 2:], boxes[order, 2:] - boxes[order, :2]]) * [0.5, 0.5, 1.0, 1.0]
+    kept = distinct(laid, SAME_PX)
     return [
-        Rectangle(u=u, v=v, width=width, height=height, coverage=float(share))
-        for (u, v, width, height), share in (
-            (laid[k].tolist(), coverage[order[k]]) for k in distinct(laid, np.array([3.0, 3.0, 5.0, 5.0]))
-        )
+        Rectangle(u=u, v=v, width=width, height=height, coverage=share)
+        for (u, v, width, height), share in zip(laid[kept].tolist(), coverage[order][kept].tolist(), strict=True)
     ]
 
 

@@ -265,7 +265,7 @@ def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Detect
     return found[0] if found else None
 
 
-def robbed_kinds(knowledge: Knowledge, kind: str, look: Array, reach_m: float = np.inf) -> tuple[str, ...]:
+def robbed_kinds(knowledge: Knowledge, kind: str, look: Array, reach_m: float) -> tuple[str, ...]:
     """Return the kinds of which a taught look is nearer to the new look than to the other looks of its own kind."""
     new = TaughtKind(name=kind, size_m=NOTHING_SIZE_M, looks=look[None], reach_m=np.array([reach_m]))
     robbed = []

@@ -22,8 +22,9 @@ from urllib.parse import parse_qs, urlsplit
 
 from hal.priorities import Priority, take_priority
 from hal.process_state import MOVES, set_memory_priority
-from service.processes.beat import PERIOD_S, SILENCE_S, Beat
+from service.processes.beat import PERIOD_S, SILENCE_S
 from service.processes.latch import LATCH, WHEN_LOST, Latch, LatchState, StopLevel
+from service.processes.watchdog import Watchdog
 
 MAX_HEAD_BYTES = 65_536  # browsers send the cookies of all pages of this machine, whatever their port
 HEAD_TIMEOUT_S = 2.0
@@ -200,58 +201,23 @@ def obey(latch: Latch, line: str) -> None:
         latch.reset(source, seen_count=int(count))
 
 
-class Watchdog:
-    """Gives the heartbeat of this process and latches the stop when the service or the cell has none.
-
-    Args:
-        folder: runtime folder of the service.
-        silence_s: see `Beat.lost`.
-        service_lost: what the loss of the service does; that of the cell always switches off.
-    """
-
-    def __init__(
-        self, latch: Latch, folder: Path, *, silence_s: float, service_lost: StopLevel = StopLevel.OFF
-    ) -> None:
-        self._latch = latch
-        self._own = Beat(folder, "stop")
-        self._others = {
-            "service": (Beat(folder, "service"), service_lost),
-            "cell": (Beat(folder, "cell"), StopLevel.OFF),
-        }
-        self._silence_s = silence_s
-
-    def look(self) -> None:
-        """Give one heartbeat and look at those of the others once; a loss is one stop, however long it lasts."""
-        self._own.beat()
-        for name, (beat, level) in self._others.items():
-            if not self._latch.has(level) and (why := beat.lost(silence_s=self._silence_s)) is not None:
-                self._latch.set(f"the {name} process {why}", level)
-
-    async def run(self) -> None:
-        """Look until cancelled."""
-        while True:
-            self.look()
-            await asyncio.sleep(PERIOD_S)
-
-
 async def _run(
     listener: socket.socket, latch: Latch, origins: tuple[str, ...], watchdog: Watchdog, service_lost: StopLevel
 ) -> None:
     server = await StopServer(latch, origins).start(listener)
     watchdog.look()
-    watching = asyncio.create_task(watchdog.run())
-    commands = asyncio.StreamReader()
-    loop = asyncio.get_running_loop()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
-    while line := await commands.readline():
-        obey(latch, line.decode("utf-8", "replace"))
-    if service_lost is StopLevel.RETREAT:
-        latch.set(GONE, service_lost)
-        await _end_of_way_back(latch)
-    latch.set(GONE)
-    watching.cancel()
+    async with watchdog.running():
+        commands = asyncio.StreamReader()
+        loop = asyncio.get_running_loop()
+        await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
+        sys.stdout.write("ready\n")
+        sys.stdout.flush()
+        while line := await commands.readline():
+            obey(latch, line.decode("utf-8", "replace"))
+        if service_lost is StopLevel.RETREAT:
+            latch.set(GONE, service_lost)
+            await _end_of_way_back(latch)
+        latch.set(GONE)
     server.close()
 
 

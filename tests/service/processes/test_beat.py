@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from hal import pauses
 from hal.process_state import ProcessState, process_state
 from service.processes.beat import ASLEEP_S, LOOK_S, STILL_S, Beat
 from service.processes.latch import Latch, StopLevel
-from service.processes.stop import Watchdog
+from service.processes.watchdog import LOOP_SILENT_S, Watchdog
 from tests.service.waiting import eventually
 
 BEATS = """
@@ -185,6 +187,32 @@ def test_the_loss_of_a_process_makes_a_stop_that_holds_one_that_switches_off(tmp
 
     eventually(is_off)
     assert latch.is_set()
+
+
+def test_the_heartbeat_of_the_stop_process_waits_for_an_event_loop_that_keeps_the_lock_of_python(
+    tmp_path: Path,
+) -> None:
+    """Readers tell a hang from the thread of the heartbeat, which must not be the one that hangs."""
+    watchdog, beat = Watchdog(Latch.create(tmp_path / "latch"), tmp_path, silence_s=0.0), Beat(tmp_path, "stop")
+
+    async def until_it_beats() -> int:
+        async with watchdog.running():
+            while beat._pid[0] == 0:  # noqa: ASYNC110 - in shared memory
+                await asyncio.sleep(0)
+        return int(beat._thread[0])
+
+    assert asyncio.run(until_it_beats()) != threading.get_native_id()
+    assert not [thread for thread in threading.enumerate() if thread.name == "heartbeat"]
+
+
+def test_the_stop_process_gives_no_heartbeat_while_its_event_loop_shows_no_life(tmp_path: Path) -> None:
+    watchdog, beat = Watchdog(Latch.create(tmp_path / "latch"), tmp_path, silence_s=0.0), Beat(tmp_path, "stop")
+    watchdog._loop_lived_s -= LOOP_SILENT_S
+    watchdog.look()
+    assert beat._pid[0] == 0
+    watchdog._loop_lived_s += 3600.0
+    watchdog.look()
+    assert beat._pid[0] == os.getpid()
 
 
 def test_the_state_of_a_process_is_that_of_the_operating_system() -> None:

@@ -76,10 +76,12 @@ class StopServer:
                 await writer.drain()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # a slow or broken client gets no answer and does not delay others
+        except asyncio.CancelledError:
+            pass  # the loop ends; `start_server` of Python 3.11 would print a traceback for a task that was cancelled
         finally:
             self._open.pop(writer, None)
             writer.close()
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, asyncio.CancelledError):
                 await writer.wait_closed()
 
     def _make_room(self, newest: asyncio.StreamWriter) -> None:

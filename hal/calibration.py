@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from hal.arrays import Array
+from hal.errors import InvalidRequest
 from hal.geometry import UncertainPose, transform_rpy
 from hal.strict import Strict, load_toml
 
@@ -137,6 +139,47 @@ class LoadRecord(Strict):
         )
 
 
+class DepthBendRecord(Strict):
+    """Slowly varying error of a range camera: what is added to the inverse depth (1/m) of its pixels.
+
+    `per_m` are the values at the nodes of a grid over the image, row by row, bilinear between them; the nodes at the corners
+    are the corner pixels.
+    """
+
+    width_px: Annotated[int, Field(ge=2, le=16384)]
+    height_px: Annotated[int, Field(ge=2, le=16384)]
+    per_m: Annotated[tuple[tuple[float, ...], ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _is_a_grid(self) -> DepthBendRecord:
+        widths = {len(row) for row in self.per_m}
+        if len(widths) != 1 or min(widths) < 2:
+            raise ValueError("per_m must have rows of one length, two or more numbers each")
+        return self
+
+    def straightened(self, depth_m: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """Return a depth image (H, W) without the bend; NaN where nothing was measured.
+
+        Raises:
+            InvalidRequest: the image has another size than those by which the bend was measured.
+        """
+        if depth_m.shape != (self.height_px, self.width_px):
+            raise InvalidRequest(
+                f"the depth image has {depth_m.shape[1]}x{depth_m.shape[0]} px, its bend was measured for"
+                f" {self.width_px}x{self.height_px}",
+                hint="set the range camera's resolution back, or run `panelwright calibrate depth` again",
+            )
+        grid = np.array(self.per_m)
+        field = bilinear_weights(self.height_px, len(grid)) @ grid @ bilinear_weights(self.width_px, grid.shape[1]).T
+        return np.asarray(1.0 / (1.0 / depth_m + field), np.float32)
+
+
+def bilinear_weights(pixels: int, nodes: int) -> Array:
+    """Return the weights (pixels, nodes) of evenly spaced nodes, the outer ones at the first and the last pixel."""
+    at = np.linspace(0.0, nodes - 1.0, pixels)
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(nodes))))
+
+
 class CalibrationRecord(Strict):
     """Calibration file of one device: the results, their date, method and quality."""
 
@@ -152,6 +195,7 @@ class CalibrationRecord(Strict):
     mount: MountRecord | None = None
     intrinsics: IntrinsicsRecord | None = None
     load: LoadRecord | None = None
+    depth_bend: DepthBendRecord | None = None
     quality: dict[str, float] = {}
 
 

@@ -1,4 +1,4 @@
-"""Calibration of camera mount, scanner mount, lens and tool load from the cell's own measurements.
+"""Calibration of camera mount, scanner mount, lens, bend of depth and tool load from the cell's own measurements.
 
 The module `calibration_poses` proposes the poses to measure from.
 """
@@ -11,6 +11,7 @@ from hal.face import load_on_first_use
 
 if TYPE_CHECKING:
     from perception.calibration.boards import BoardView, Charuco, Dots
+    from perception.calibration.depth_bend import calibrate_depth
     from perception.calibration.in_hand import InHandCalibration, calibrate_in_hand, propose_view
     from perception.calibration.in_hand_model import UNKNOWN_LENS, Beforehand, InHandState, InHandView
     from perception.calibration.intrinsics import calibrate_camera
@@ -33,6 +34,7 @@ __all__ = [
     "ScannerView",
     "WrenchCalibration",
     "calibrate_camera",
+    "calibrate_depth",
     "calibrate_in_hand",
     "calibrate_scanner",
     "calibrate_tip",

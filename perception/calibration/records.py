@@ -7,6 +7,7 @@ import numpy as np
 from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, MountRecord, Vector3
 from hal.geometry import UncertainPose
 from hal.toml_text import toml_edited, toml_text
+from perception.calibration.depth_bend import DepthBend
 from perception.calibration.hand_eye import HandEye
 from perception.calibration.in_hand import InHandCalibration
 from perception.calibration.in_hand_model import FREE
@@ -28,7 +29,7 @@ def mount_of(parent_from_device: UncertainPose) -> MountRecord:
 
 def record_of(
     device: str,
-    result: HandEye | InHandCalibration | CameraCalibration | ScannerCalibration | WrenchCalibration,
+    result: HandEye | InHandCalibration | CameraCalibration | ScannerCalibration | WrenchCalibration | DepthBend,
     *,
     date: str,
 ) -> CalibrationRecord:
@@ -50,6 +51,9 @@ def record_of(
         return CalibrationRecord(
             device=device, date=date, method="plate-scans", mount=mount_of(result.flange_from_scanner), quality=quality
         )
+    if isinstance(result, DepthBend):
+        quality = {"bend_before_per_m": result.before, "bend_after_per_m": result.after, "walls": float(result.walls)}
+        return CalibrationRecord(device=device, date=date, method="walls", depth_bend=result.record, quality=quality)
     if isinstance(result, WrenchCalibration):
         load = result.load
         sigma = np.sqrt(np.diag(result.covariance))
@@ -64,7 +68,7 @@ def record_of(
 
 def renewed(current: CalibrationRecord, found: CalibrationRecord) -> CalibrationRecord:
     """Return the present record updated with the new results, with its version incremented."""
-    parts = {name: getattr(found, name) for name in ("mount", "intrinsics", "load")}
+    parts = {name: getattr(found, name) for name in ("mount", "intrinsics", "load", "depth_bend")}
     update = {name: part for name, part in parts.items() if part is not None}
     update["to_measure"] = tuple(part for part in current.to_measure if part not in update)
     about = {"date": found.date, "method": found.method, "quality": found.quality, "version": current.version + 1}

@@ -16,6 +16,7 @@ from rich.table import Table
 from service.client import Client
 from service.commands.board import board
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, client_of, console, read_cell
+from service.commands.depth import depth
 from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
 from service.commands.tip import tip
 from service.commands.zero import zero
@@ -25,6 +26,7 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 app.command()(board)
+app.command()(depth)
 app.command()(tip)
 app.command()(zero)
 Poses = Annotated[int, typer.Option(min=4, max=40, help="Number of stations to measure from.")]

@@ -19,6 +19,7 @@ from service.commands.warm import compile_first
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from hal.arrays import Array
     from perception.range import BatchResult, KeptResults, Match, RangeScene, Reading, Surface
 
 batch = typer.Typer(help="Process folders of recordings with many workers (dask).", no_args_is_help=True)
@@ -40,6 +41,9 @@ def range_image(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the results; created if missing.")] = Path(),
     models: Annotated[str | None, typer.Option(help="Also find components: a file of models, or `shipped`.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Calibration record whose depth_bend is taken out (`calibrate depth`).")
+    ] = None,
     scale: Scale = None,
     near: Near = None,
     far: Far = None,
@@ -60,10 +64,12 @@ def range_image(
         write_png,
     )
 
-    reading = _reading(scale, near, far, focal, centre, pitch)
+    reading = reading_of(scale, near, far, focal, centre, pitch)
     library = () if models is None else load_models() if models == "shipped" else load_models(Path(models))
     compile_first()
     depth, sensor = load_recording(file, reading=reading)
+    if record is not None:
+        depth = _without_bend(depth, record)
     scene = analyse(depth, sensor)
     matches = match_models(scene, depth, library) if library else ()
     assumed = assumptions(file, reading)
@@ -104,7 +110,7 @@ def batch_range_images(
     """
     from perception.range import KeptResults, batch_range, recordings_in
 
-    reading = _reading(scale, near, far, focal, centre, pitch)
+    reading = reading_of(scale, near, far, focal, centre, pitch)
     total = len(recordings_in(folder))
     _in_folder(out.parent)  # checked before hours of work
     kept = KeptResults(out, folder, reading, afresh=afresh)
@@ -136,7 +142,7 @@ def batch_range_images(
     raise typer.Exit(1 if failed else 0)
 
 
-def _reading(
+def reading_of(
     scale: float | None,
     near: float | None,
     far: float | None,
@@ -144,6 +150,7 @@ def _reading(
     centre: str | None,
     pitch: float | None,
 ) -> Reading:
+    """Return how a recording is to be read, from the options of a command."""
     from perception.range import Reading
 
     return Reading(
@@ -154,6 +161,20 @@ def _reading(
         centre_px=None if centre is None else _pair(centre, "--centre"),
         pitch_m=pitch,
     )
+
+
+def _without_bend(depth_m: Array, path: Path) -> Array:
+    """Return a depth image without the bend of a record.
+
+    Raises:
+        InvalidRequest: the record has none, or that of another resolution.
+    """
+    from hal.calibration import load_calibration
+
+    bend = load_calibration(path).depth_bend
+    if bend is None:
+        raise InvalidRequest(f"{path} has no [depth_bend]", hint="measure it with `panelwright calibrate depth`")
+    return bend.straightened(depth_m).astype(float)
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:

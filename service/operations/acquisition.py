@@ -194,8 +194,9 @@ def scan(session: Session) -> Scan:
     sample = device.read_range(deadline=deadline())
     depth_m = sample.usable(now_s=asked_s, max_age_s=OLDEST_S, device=name).depth_m
     _refuse_frozen(session, name, sample, depth_m)
+    bend = session.cell.calibration_of(name).depth_bend
     return Scan(
-        depth_m=depth_m,
+        depth_m=depth_m if bend is None else bend.straightened(depth_m),
         stamp_s=sample.host_time_s,
         scanner=name,
         capabilities=capabilities,

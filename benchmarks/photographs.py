@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from benchmarks.display_drawing import PHOTOGRAPHS, draw_photograph
+from benchmarks.photograph_scenes import draw_scene, draw_without
 from benchmarks.vision_dials import DrawnDial, draw_dial
 from benchmarks.vision_manometers import USUAL, Print, Way, draw_manometer
 from hal.arrays import Image
@@ -171,6 +172,23 @@ def _printed_gauges(seeds: range, *, scale: bool) -> Iterator[Case]:
             yield Case(image=drawn.image, read=read, truth=truth, within=GAUGE_WITHIN * drawn.full)
 
 
+def _gauges_anywhere(seeds: range, *, scale: bool) -> Iterator[Case]:
+    """Yield gauges somewhere in a picture, with legible numerals also where they are foreshortened."""
+    for seed in seeds:
+        way = printed_way(seed)
+        scene = draw_scene(seed, way)
+        if way.print is not None and way.print.height * 0.5 * scene.width_px * np.cos(scene.tilt_rad) >= LEGIBLE_PX:
+            read = partial(read_photograph, scale=(0.0, scene.full)) if scale else read_photograph
+            truth = scene.reading / 10 * scene.full
+            yield Case(image=scene.image, read=read, truth=truth, within=GAUGE_WITHIN * scene.full)
+
+
+def _nothing_anywhere(seeds: range) -> Iterator[Case]:
+    """Yield pictures without an instrument, where no answer is right."""
+    for seed in seeds:
+        yield Case(image=draw_without(seed), read=read_photograph, truth=float("nan"))
+
+
 def any_way(seed: int) -> Way:
     """Return a sweep of 40 to 340 degrees, turned by up to 20 degrees, the same for the same seed."""
     rng = np.random.default_rng((seed, 5))
@@ -188,12 +206,13 @@ def _drawn_dials(
                    circle=10.0)  # fmt: skip
 
 
-def _drawn_displays(seeds: range, kind: str, *, negative: bool = False) -> Iterator[Case]:
+def _drawn_displays(seeds: range, kind: str, *, negative: bool = False, is_told: bool = True) -> Iterator[Case]:
     for seed in seeds:
         drawn = draw_photograph(seed, kind)
         if negative and not drawn.text.startswith("-"):
             continue
-        yield Case(image=drawn.image, read=partial(_display, is_scene=kind == "scene"), truth=drawn.text)
+        read = partial(_display, is_scene=kind == "scene") if is_told else read_photograph
+        yield Case(image=drawn.image, read=read, truth=drawn.text)
 
 
 def drawn_sets(first: int, count: int) -> Iterator[tuple[str, float, Iterable[Case]]]:
@@ -205,6 +224,11 @@ def drawn_sets(first: int, count: int) -> Iterator[tuple[str, float, Iterable[Ca
     printed = range(first, first + 2 * count)
     yield "drawn: printed gauges, told nothing", PASS["told nothing"], _printed_gauges(printed, scale=False)
     yield "drawn: printed gauges, told the scale", PASS["told the scale"], _printed_gauges(printed, scale=True)
+    yield "drawn: gauges anywhere, told nothing", PASS["told nothing"], _gauges_anywhere(printed, scale=False)
+    yield "drawn: gauges anywhere, told the scale", PASS["told the scale"], _gauges_anywhere(printed, scale=True)
+    yield "drawn: pictures without an instrument", 0.0, _nothing_anywhere(seeds)
+    for kind in PHOTOGRAPHS:
+        yield f"drawn: displays, {kind}, kind not told", 0.0, _drawn_displays(seeds, kind, is_told=False)
     yield "drawn: gauges, told the scale", PASS["told the scale"], _drawn_gauges(seeds, usual, ends=False)
     yield "drawn: gauges, told the ends", PASS["told the ends"], _drawn_gauges(seeds, usual, ends=True)
     yield "drawn: 40 to 340 deg, turned, scale", 0.0, _drawn_gauges(seeds, any_way, ends=False)

@@ -7,7 +7,7 @@ tested on seeds 70000 to 70320, 71000 to 71099 and 84000 to 84199.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -67,10 +67,21 @@ UNUSUAL = {
 LEAST_APART = 0.06  # of the scale: two pointers of one gauge that are nearer hide each other
 
 
-def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
-    """Draw a pressure gauge of random design with a reading from 0 to 10, the same for the same seed."""
+def draw_manometer(seed: int, way: Way = USUAL, share: float | None = None) -> DrawnDial:
+    """Draw a pressure gauge of random design with a reading from 0 to 10, the same for the same seed.
+
+    Args:
+        share: of the scale, at which the pointer stands; None: by the seed, which decides all the rest in any case.
+    """
     rng = np.random.default_rng(seed)
-    share = float(rng.uniform(0.0, 0.98))
+    pen, drawn = on_canvas(rng, way, share)
+    return replace(drawn, image=_photographed(pen, rng))
+
+
+def on_canvas(rng: Rng, way: Way, at: float | None = None) -> tuple[Pen, DrawnDial]:
+    """Draw a pressure gauge, and return the pen that drew it and the drawing as it is on the canvas."""
+    by_seed = float(rng.uniform(0.0, 0.98))
+    share = by_seed if at is None else at
     angle = way.angle_rad(share)
     pen = _mounted(rng)
     level = int(rng.integers(215, 250))
@@ -80,14 +91,9 @@ def draw_manometer(seed: int, way: Way = USUAL) -> DrawnDial:
     if red is not None:
         _red_pointer(pen, rng, way.angle_rad(red))
     shape = _shadow_and_pointer(pen, rng, angle, POINTERS[0] if way.has_red else None)
-    return DrawnDial(
-        image=_photographed(pen, rng),
-        reading=10 * share,
-        circular=False,
-        shape=shape,
-        red=None if red is None else 10 * red,
-        full=full,
-    )
+    return pen, DrawnDial(
+        image=pen.canvas, reading=10 * share, circular=False, shape=shape, red=None if red is None else 10 * red, full=full
+    )  # fmt: skip
 
 
 def _second_share(rng: Rng, first: float) -> float:
@@ -153,15 +159,8 @@ def _face(pen: Pen, rng: Rng, way: Way) -> float:
             at = (-float(rng.uniform(0.45, 0.55)), 0.14 * side)
             pen.disc(0.0, at, 0.05, (110, 110, 110))
             pen.disc(0.0, at, 0.035, (190, 190, 195))
-            cv2.line(
-                pen.canvas,
-                pen.place(0, (at[0] - 0.03, at[1])),
-                pen.place(0, (at[0] + 0.03, at[1])),
-                (70, 70, 70),
-                3,
-                cv2.LINE_AA,
-                4,
-            )
+            left, right = (pen.place(0, (at[0] + off, at[1])) for off in (-0.03, 0.03))
+            cv2.line(pen.canvas, left, right, (70, 70, 70), 3, cv2.LINE_AA, 4)
     return full
 
 
@@ -260,16 +259,24 @@ def _one_pointer(pen: Pen, shape: str, angle: float, reach: float, tail: float, 
 
 def _photographed(pen: Pen, rng: Rng) -> Image:
     """Return the canvas behind glass, seen slightly at an angle, after light, lens, noise and JPEG."""
-    canvas = pen.canvas.astype(np.float32)
-    if rng.random() < 0.5:
-        canvas = _reflected(canvas, pen, rng)
-    aslant = seen_aslant(
-        np.clip(canvas, 0, 255).astype(np.uint8), float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0, 0.08))
-    )
+    aslant = seen_aslant(behind_glass(pen, rng), float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0, 0.08)))
     side = round(np.exp(rng.uniform(np.log(SMALLEST_PX), np.log(LARGEST_PX))))
     picture = np.asarray(cv2.resize(aslant, (side, side), interpolation=cv2.INTER_AREA), np.float32)
-    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.3, 0.5 + 0.005 * side))), np.float32)
-    y, x = np.mgrid[:side, :side] / side
+    return taken(picture, 0.5 + 0.005 * side, rng)
+
+
+def behind_glass(pen: Pen, rng: Rng) -> Image:
+    """Return the canvas of a pen, half of the times with a reflection in the glass over the face."""
+    canvas = pen.canvas.astype(np.float32)
+    return np.asarray(np.clip(_reflected(canvas, pen, rng) if rng.random() < 0.5 else canvas, 0, 255), np.uint8)
+
+
+def taken(picture: NDArray[np.float32], most_blur_px: float, rng: Rng) -> Image:
+    """Return a scene (H, W, 3) after lens, uneven light, noise and JPEG."""
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.3, most_blur_px))), np.float32)
+    height, width = picture.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    y, x = y / height, x / width
     light = (1 + rng.uniform(-0.4, 0.4) * (x - 0.5) + rng.uniform(-0.4, 0.4) * (y - 0.5)) * rng.uniform(0.4, 1.05)
     lit = picture * light[..., None] * rng.uniform(0.85, 1.0, 3)
     noisy = lit + rng.normal(0.0, float(rng.uniform(0.5, 5.0)), lit.shape)

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from perception.vision.panel_ways.outline import find_by_outline
     from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, compare
     from perception.vision.panel_ways.tags import find_by_tags
-    from perception.vision.photographs.reader import PhotographKind, read_photograph
+    from perception.vision.photographs.motion import over_pictures
+    from perception.vision.photographs.reader import read_photograph
     from perception.vision.projection import CameraProjection, PanelProjection
     from perception.vision.quadrangle import estimate
     from perception.vision.reading import ObjectReading, answer_at
@@ -40,7 +41,6 @@ __all__ = [
     "PanelProjection",
     "PanelSighting",
     "PanelWay",
-    "PhotographKind",
     "RimView",
     "TaughtKind",
     "answer_at",
@@ -67,6 +67,7 @@ __all__ = [
     "load_knowledge",
     "merge_views",
     "one_plate",
+    "over_pictures",
     "read_photograph",
     "recognise",
     "said",

@@ -12,6 +12,7 @@ from hal.arrays import Array
 
 ANSWER_AT = 0.5  # confidence below which a reading is refused, unless the caller asks for less or for more
 MOST_DOUBTED = 0.49  # highest confidence of a guess that a reader has a reason to refuse
+FULL_TURN_RAD = 2 * np.pi - 1e-6
 NO_EDGE = "the cap's edge cannot be found: come closer or add light"
 ALIKE = "pressed and released look alike from here: look from the side or closer"
 TOO_WEAK = "the evidence is too weak: come closer, change the angle or the light"
@@ -94,6 +95,54 @@ class SeenScale:
     at_min_rad: float
     at_max_rad: float
 
+    @property
+    def is_full_turn(self) -> bool:
+        """Whether the scale closes."""
+        return abs(self.at_max_rad - self.at_min_rad) > FULL_TURN_RAD
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenFace:
+    """Where the round face of an instrument is in a picture, seen aslant or not, px.
+
+    Attributes:
+        middle: (u, v).
+        right, up: from the middle to the rim, where a pointer is that points to the right, and straight up.
+    """
+
+    middle: tuple[float, float]
+    right: tuple[float, float]
+    up: tuple[float, float]
+
+    def moved(self, move: Array) -> SeenFace:
+        """Return the face in the picture whose pixels are those of this one times the projective map `move` (3, 3)."""
+        tips = np.array([self.middle, np.add(self.middle, self.right), np.add(self.middle, self.up)])
+        there = np.column_stack([tips, np.ones(3)]) @ move.T
+        middle, right, up = there[:, :2] / there[:, 2:]
+        return SeenFace(
+            middle=_pair(middle), right=_pair(right - middle), up=_pair(up - middle)
+        )  # fmt: skip
+
+
+def _pair(place: Array) -> tuple[float, float]:
+    u, v = place
+    return float(u), float(v)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """How a reading changes over several pictures, oldest first.
+
+    Attributes:
+        values: in each picture; None where it was not read.
+        amplitude: half of their range about the trend.
+        trend: mean change from one picture to the next.
+    """
+
+    values: tuple[float | None, ...]
+    amplitude: float
+    trend: float
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchReading(Answer):
@@ -102,10 +151,14 @@ class PatchReading(Answer):
     Attributes:
         pointers: those of a gauge that has more than one.
         scale: of a gauge in a photograph, what was taken for its scale.
+        face: of a gauge or a dial in a photograph, where its face is.
+        motion: of an instrument in several pictures, of which `value` is the mean.
     """
 
     pointers: tuple[SeenPointer, ...] = ()
     scale: SeenScale | None = None
+    face: SeenFace | None = None
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

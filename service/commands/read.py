@@ -1,4 +1,4 @@
-"""`panelwright read`: reads one instrument in a photograph, without a cell or a service."""
+"""`panelwright read`: reads one instrument in a photograph, or in several, without a cell or a service."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from rich.markup import escape
 from hal.errors import InvalidRequest
 from service.commands.common import console
 from service.commands.teach import read_image
-from service.knowledge.photographs import read_pixels
-from service.schema.results import PhotographReading
+from service.knowledge.photographs import draw_reading, read_pictures
+from service.report.plots import png_of
+from service.schema.results import PhotographMotion, PhotographReading
 
 RANGE = ".."
 
@@ -34,15 +35,23 @@ class PointerColour(StrEnum):
     RED = "red"
 
 
+Photos = Annotated[
+    list[Path], typer.Argument(help="PNG, JPEG or BMP; several of one instrument, oldest first, tell how it moves.")
+]
+Kind = Annotated[
+    InstrumentKind | None,
+    typer.Option(
+        help="gauge: scale over part of a turn; dial: full turn from straight up; display: digits of segments or dots, or drums; "
+        "found anywhere in the picture if not given."
+    ),
+]
+Picture = Annotated[Path | None, typer.Option(help="Write the last photograph with what was found to this PNG file.")]
+
+
 def read(
-    photo: Annotated[Path, typer.Argument(help="PNG, JPEG or BMP, cropped to the instrument.")],
+    photos: Photos,
     *,
-    kind: Annotated[
-        InstrumentKind,
-        typer.Option(
-            help="gauge: scale over part of a turn; dial: full turn from straight up; display: seven segments."
-        ),
-    ],
+    kind: Kind = None,
     scale: Annotated[
         str | None,
         typer.Option(
@@ -59,20 +68,22 @@ def read(
         PointerColour | None, typer.Option(help="Which pointer is read if a red one stands beside another one.")
     ] = None,
     unit: Annotated[str, typer.Option(help="Unit of the scale.")] = "",
-    scene: Annotated[bool, typer.Option("--scene", help="The picture is not cropped to the display.")] = False,
+    scene: Annotated[bool, typer.Option("--scene", help="The picture is not cropped to the kind given.")] = False,
     least_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Readings with a lower confidence are refused.")
     ] = 0.5,
+    picture: Picture = None,
     json: Annotated[bool, typer.Option("--json", help="Print the whole answer as JSON.")] = False,
 ) -> None:
-    """Read one gauge, dial or display in a photograph, of which only the kind is known, and perhaps the scale.
+    """Read one gauge, dial or display in a photograph; its kind, its place and its scale are found if they are not told.
 
     The exit code is 1 when the instrument cannot be read.
     """
     ends_deg = _span(ends, "--ends")
-    found = read_pixels(
-        read_image(photo),
-        kind.value,
+    pictures = [read_image(photo) for photo in photos]
+    found = read_pictures(
+        pictures,
+        None if kind is None else kind.value,
         scale=_span(scale, "--scale"),
         ends_rad=None if ends_deg is None else (math.radians(ends_deg[0]), math.radians(ends_deg[1])),
         pointer=None if pointer is None else pointer.value,
@@ -80,6 +91,8 @@ def read(
         is_scene=scene,
         least_confidence=least_confidence,
     )
+    if picture is not None:
+        _write(picture, png_of(draw_reading(pictures[-1], found)))
     if json:
         typer.echo(found.model_dump_json())
     else:
@@ -88,14 +101,31 @@ def read(
         raise typer.Exit(1)
 
 
+def _write(file: Path, data: bytes) -> None:
+    try:
+        file.write_bytes(data)
+    except OSError as error:
+        raise InvalidRequest(f"{file} cannot be written: {error.strerror}", hint="choose another --picture") from None
+
+
 def _said(found: PhotographReading) -> str:
     if not found.answered:
         return f"cannot tell: {found.reason}"
     sure = f"confidence {found.confidence:.2f}"
     if found.text is not None:
-        return f"{found.text} {found.unit}".strip() + f"  ({sure})"
-    by = "" if found.scale is None else f", on a scale from {found.scale.minimum:g} to {found.scale.maximum:g}"
-    return f"{found.value:.4g} {found.unit}".strip() + f"  (one sigma {found.uncertainty:.2g}, {sure}{by})"
+        said = f"{found.text} {found.unit}".strip() + f"  ({sure})"
+    else:
+        by = "" if found.scale is None else f", on a scale from {found.scale.minimum:g} to {found.scale.maximum:g}"
+        said = f"{found.value:.4g} {found.unit}".strip() + f"  (one sigma {found.uncertainty:.2g}, {sure}{by})"
+    return said if found.motion is None else f"{said}\n{_moving(found.motion)}"
+
+
+def _moving(motion: PhotographMotion) -> str:
+    read = sum(value is not None for value in motion.values)
+    return (
+        f"mean of {read} of {len(motion.values)} pictures; "
+        f"amplitude {motion.amplitude:.2g}, trend {motion.trend:+.2g} from one to the next"
+    )
 
 
 def _span(text: str | None, option: str) -> tuple[float, float] | None:

@@ -114,6 +114,7 @@ TABLE: dict[str, Row] = {
     "PUT /v1/rounds/{round}": MAINTAINER,  # about later; a round that is due waits while somebody holds the lease
     "DELETE /v1/rounds/{round}": MAINTAINER,
     "POST /v1/knowledge/outline": OPERATOR,
+    "POST /v1/read": OPERATOR,
     "POST /v1/read-photograph": OPERATOR,
     "POST /v1/panel-pose": OPERATOR_TASK,
     "POST /v1/recognise": OPERATOR_TASK,

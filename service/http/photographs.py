@@ -1,4 +1,4 @@
-"""`POST /v1/read-photograph`: reads one instrument in a stored photograph; nothing moves."""
+"""`POST /v1/read`: reads one instrument in a stored photograph, or in several; nothing moves."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ router = APIRouter(prefix="/v1", tags=["images"], responses=RESPONSES)
 EXAMPLE = {"image": "3f9c2a7be01d4c553f9c2a7b", "kind": "gauge", "scale": [0.0, 10.0], "unit": "bar"}
 
 
+@router.post("/read-photograph", include_in_schema=False)  # the path until 0.9
 @router.post(
-    "/read-photograph",
+    "/read",
     summary="Read one instrument in a stored photograph",
     operation_id="read_photograph",
     openapi_extra=body_schema(ReadPhotographRequest, EXAMPLE, required=True),

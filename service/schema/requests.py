@@ -232,16 +232,28 @@ class EvaluateRequest(Strict):
     mission: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}$")]
 
 
+InstrumentKind = Literal["gauge", "dial", "display"]
+MOST_PICTURES = 50
+
+
 class ReadPhotographRequest(Strict):
-    """Read one instrument in a stored photograph, of which only the kind is known, and perhaps the scale."""
+    """Read one instrument in a stored photograph, or in several; kind, place and scale are found if they are not told."""
 
     image: Annotated[ImageId, Field(description="id of a stored image (POST /v1/images)")]
-    kind: Annotated[
-        Literal["gauge", "dial", "display"],
+    further: Annotated[
+        tuple[ImageId, ...],
         Field(
-            description="gauge: scale over part of a turn; dial: full turn from straight up; display: seven segments"
+            max_length=MOST_PICTURES - 1,
+            description="later pictures of the same instrument, oldest first; the answer is their mean, with the motion",
         ),
-    ]
+    ] = ()
+    kind: Annotated[
+        InstrumentKind | None,
+        Field(
+            description="gauge: scale over part of a turn; dial: full turn from straight up; display: seven segments; "
+            "null: whichever is found anywhere in the picture"
+        ),
+    ] = None
     scale: Annotated[
         tuple[float, float] | None,
         Field(
@@ -262,5 +274,7 @@ class ReadPhotographRequest(Strict):
         ),
     ] = None
     unit: Annotated[str, Field(max_length=40, description="unit of the scale, repeated in the answer")] = ""
-    is_scene: Annotated[bool, Field(description="the picture is not cropped to the display")] = False
+    is_scene: Annotated[bool, Field(description="the picture is not cropped to an instrument whose kind is told")] = (
+        False
+    )
     least_confidence: LeastConfidence = ANSWER_AT

@@ -284,15 +284,34 @@ class PhotographScale(Result):
     at_max_rad: Annotated[float, Field(description="pointer angle at the maximum, clockwise from up")]
 
 
+class PhotographFace(Result):
+    """Where the round face of an instrument is in a photograph, px: a circle, or an ellipse if it is seen aslant."""
+
+    middle: tuple[float, float]
+    right: Annotated[tuple[float, float], Field(description="from the middle to where a pointer to the right ends")]
+    up: Annotated[tuple[float, float], Field(description="from the middle to where a pointer straight up ends")]
+
+
+class PhotographMotion(Result):
+    """How a reading changes over several pictures, in `unit`."""
+
+    values: Annotated[tuple[float | None, ...], Field(description="in each picture; null where it was not read")]
+    amplitude: Annotated[float, Field(description="half of their range about the trend")]
+    trend: Annotated[float, Field(description="mean change from one picture to the next")]
+
+
 class PhotographReading(Result):
     """The reading of an instrument in a photograph, or the reason why it cannot be read.
 
     `confidence` is the probability that the reading is right; for a refused reading, that its guess is right.
     """
 
-    kind: str
+    kind: Annotated[str | None, Field(description="gauge, dial or display; null if it was not told and none is found")]
     answered: bool
-    value: Annotated[float | None, Field(description="value in `unit`; for a display, its text as a number")]
+    value: Annotated[
+        float | None,
+        Field(description="value in `unit`, over several pictures their mean; for a display, its text as a number"),
+    ]
     unit: str
     uncertainty: Annotated[float | None, Field(description="one standard deviation of `value`")]
     text: Annotated[str | None, Field(description="text of a display")]
@@ -302,6 +321,10 @@ class PhotographReading(Result):
     pointers: Annotated[
         tuple[PhotographPointer, ...], Field(description="the pointers of a gauge that has more than one; else empty")
     ] = ()
-    scale: Annotated[
-        PhotographScale | None, Field(description="what was taken for a gauge's scale; null for other kinds")
+    scale: Annotated[PhotographScale | None, Field(description="what was taken for the scale; null for a display")] = (
+        None
+    )
+    face: Annotated[
+        PhotographFace | None, Field(description="where a gauge's or a dial's face was found, in the last picture")
     ] = None
+    motion: Annotated[PhotographMotion | None, Field(description="over several pictures; null for a single one")] = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -15,8 +16,9 @@ from tests.docs.test_examples import run
 PAGE = "tutorials/read-a-photograph.md"
 
 
-def test_the_page_prints_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
+def test_the_page_prints_what_it_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    monkeypatch.chdir(tmp_path)
     text = (ROOT / "docs" / PAGE).read_text(encoding="utf-8")
     steps = re.findall(r"```bash\n(.*?)```\s+```text\n(.*?)```", text, flags=re.DOTALL)
     assert len(steps) == 3
@@ -25,6 +27,7 @@ def test_the_page_prints_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
             told = CliRunner().invoke(_app(), shlex.split(command)[1:])
             assert " ".join(told.output.split()) == " ".join(line.split())
             assert told.exit_code == (1 if line.startswith("cannot tell") else 0)
+    assert (tmp_path / "read.png").is_file()
 
 
 def test_the_python_code_reads_both_pointers(monkeypatch: pytest.MonkeyPatch) -> None:

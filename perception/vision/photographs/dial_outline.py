@@ -1,13 +1,13 @@
-"""Search for the round outline of a dial that fills the picture: its middle and radius."""
+"""Search for the outline of a dial that fills the picture: its middle and radius; and its fit, also to an ellipse."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from hal.arrays import Image
+from hal.arrays import Array, Image
 from perception.vision.bilinear import polar_values
-from perception.vision.finding.circles import Circle, find_circles
+from perception.vision.finding.circles import find_circles
 from perception.vision.finding.shapes import find_edges
 
 SIDE_PX = 220
@@ -18,6 +18,7 @@ WHOLE = 0.9
 TURNS = np.linspace(0, 2 * np.pi, 120, endpoint=False)
 NORMALS = np.column_stack([np.sin(TURNS), -np.cos(TURNS)])
 REACHES = (0.12, 0.07, 0.04, 0.04)  # of the radius, on either side of the current outline
+LEAST_REACH_PX = 1.0
 LEAST_SLOPE = 0.3  # relative to the median along the outline
 
 
@@ -43,30 +44,49 @@ def dial_circle(gray: Image, scale: float) -> tuple[float, float, float]:
     if not circles:
         return float(middle[0]) * ratio, float(middle[1]) * ratio, UNSEEN_RIM * min(width, height) * ratio
     whole = WHOLE * max(c.coverage for c in circles)
-    best = _settled(picture, min((c for c in circles if c.coverage >= whole), key=lambda c: c.radius))
-    return best[0] * ratio, best[1] * ratio, best[2] * ratio
+    best = min((c for c in circles if c.coverage >= whole), key=lambda c: c.radius)
+    fitted, rim = settled(picture, np.array([best.u, best.v]), best.radius * np.eye(2), is_round=True)
+    return float(fitted[0]) * ratio, float(fitted[1]) * ratio, float(rim[0, 0]) * ratio
 
 
-def _settled(picture: Image, circle: Circle) -> tuple[float, float, float]:
-    """Return middle and radius fitted to the steepest change across the outline, of the sign that prevails along it.
+def settled(picture: Image, middle: Array, rim: Array, *, is_round: bool) -> tuple[Array, Array]:
+    """Return middle and rim of an outline fitted to the steepest change across it, of the sign that prevails along it.
 
-    This is needed because votes may place a circle anywhere on a wide edge.
+    This is needed because votes may place an outline anywhere on a wide edge.
+
+    Args:
+        picture: (H, W) uint8.
+        middle: (2,) px.
+        rim: (2, 2) px: a point of the unit circle times it is a point of the outline, seen from its middle.
+        is_round: whether only middle and size are fitted; the shape of the ellipse is, too, if not.
     """
     smooth: Image = np.ascontiguousarray(cv2.GaussianBlur(picture, (0, 0), 1.0), np.uint8)
-    u, v, radius = circle.u, circle.v, circle.radius
-    J = np.column_stack([NORMALS, np.ones(len(TURNS))])
+    x, y = NORMALS.T
+    J = np.column_stack([x, y, np.ones(len(TURNS)), x * x - y * y, 2 * x * y])[:, : 3 if is_round else 5]
     for reach in REACHES:
-        radii = np.arange((1 - reach) * radius, (1 + reach) * radius, 0.5)
-        slope = np.diff(polar_values(smooth, (u, v), radii, np.ascontiguousarray(NORMALS.T)), axis=0)
+        size = float(np.sqrt(abs(np.linalg.det(rim))))
+        if reach * size < LEAST_REACH_PX:
+            break
+        radii = np.arange(1 - reach, 1 + reach, 0.5 / size)
+        slope = np.diff(
+            polar_values(smooth, (float(middle[0]), float(middle[1])), radii, np.ascontiguousarray(rim @ NORMALS.T)),
+            axis=0,
+        )
         slope *= np.sign((slope * np.abs(slope)).sum())
-        off = radii[slope.argmax(axis=0)] + 0.25 - radius
+        off = radii[slope.argmax(axis=0)] + 0.25 / size - 1.0
         steep = slope.max(axis=0)
         found = steep > LEAST_SLOPE * np.median(steep)
-        solution = np.array([0.0, 0.0, float(np.median(off[found]))])
+        if not found.any():
+            break
+        solution = np.zeros(J.shape[1])
+        solution[2] = np.median(off[found])
         for _ in range(8):
             residual = off - J @ solution
-            spread = max(0.5, 1.4826 * float(np.median(np.abs(residual[found]))))
+            spread = max(0.5 / size, 1.4826 * float(np.median(np.abs(residual[found]))))
             weight = found / (1 + (residual / spread) ** 2) ** 2
-            solution = np.linalg.solve(J.T @ (weight[:, None] * J) + 1e-6 * np.eye(3), J.T @ (weight * off))
-        u, v, radius = u + solution[0], v + solution[1], radius + solution[2]
-    return float(u), float(v), float(radius)
+            solution = np.linalg.solve(J.T @ (weight[:, None] * J) + 1e-6 * np.eye(J.shape[1]), J.T @ (weight * off))
+        growth = (1 + solution[2]) * np.eye(2)
+        if not is_round:
+            growth += np.array([[solution[3], solution[4]], [solution[4], -solution[3]]])
+        middle, rim = middle + rim @ solution[:2], rim @ growth
+    return middle, rim

@@ -28,6 +28,10 @@ MANTISSAS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.5, 8.0)  # of the step be
 SAME_SWEEP_RAD = np.deg2rad(25.0)  # the last number of a second scale may stand before its end
 MOST_FURTHER = 4  # steps by which a scale goes on at either end beyond the numbers that were read
 UPRIGHT_RAD = np.deg2rad(5.0)  # most scales lie evenly about straight up
+TURN_STEPS, OFF_TURN = (
+    (8, 10, 12),
+    0.03,
+)  # steps of a scale that is a full turn, and by how much of it they may miss a turn
 LEAST_SHARE = 0.5  # of a scale that is told, which its numbers must span
 PROVEN, SURE, LIKELY = 4, 0.93, 0.75  # numbers beyond those that lack which make a scale sure, and its confidence then
 OUTER = 0.6  # of the radius: a scale further in may have an outer one, in another unit, that was not read
@@ -78,6 +82,21 @@ class PrintedScale:
     def is_proven_if_told(self) -> bool:
         """Whether a reading on this scale is sure where its end values are told, too."""
         return self.numbers - self.lacking >= PROVEN - 1
+
+    def full_turn(self) -> float | None:
+        """Return the value of a full turn of a scale that begins with 0 straight up; None if it is no such scale.
+
+        It is negative if the values rise counter-clockwise.
+        """
+        slope = (self.at_max - self.at_min) / (self.maximum - self.minimum)
+        at_zero = self.at_min - slope * self.minimum
+        at_zero -= 2 * np.pi * round(at_zero / (2 * np.pi))
+        steps = abs(2 * np.pi / slope) / self.step
+        if abs(at_zero) > UPRIGHT_RAD or self.minimum < 0.0 or round(steps) not in TURN_STEPS:
+            return None
+        if abs(steps - round(steps)) > OFF_TURN * steps or self.maximum > (round(steps) + OFF_STEP) * self.step:
+            return None
+        return float(np.copysign(round(steps) * self.step, slope))
 
     def whole(self) -> PrintedScale:
         """Return the scale with the ends that lie evenly about straight up, where numbers at its ends were not read."""

@@ -122,7 +122,21 @@ def _radial(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _numbers(found: Characters, place: Place) -> Iterator[Number]:
-    """Yield the numbers that neighbouring digits make, without those that are part of a word or have lost a point."""
+    """Yield the numbers that neighbouring digits make, at their places on the dial."""
+    for text, line, probability in rows_of_digits(found):
+        angle_rad, off = place(np.array(0.5 * (line.left + line.right)), np.array(line.level))
+        if RING[0] < off < RING[1]:
+            yield Number(
+                value=float(text), text=text, angle_rad=float(angle_rad), off=float(off), height=line.tall / RADIUS_PX,
+                probability=probability,
+            )  # fmt: skip
+
+
+def rows_of_digits(found: Characters) -> Iterator[tuple[str, Line, float]]:
+    """Yield text, room and probability of the numbers that neighbouring digits make.
+
+    Those that are part of a word, or have lost a point, are left out.
+    """
     likely = found.kinds[:, :OTHER].max(axis=1, initial=0.0)
     digits = found.kinds[:, :OTHER].argmax(axis=1)
     used: set[int] = set()
@@ -133,20 +147,14 @@ def _numbers(found: Characters, place: Place) -> Iterator[Number]:
         used.update(row)
         text = "".join("." * (k in points) + str(digits[one]) for k, one in enumerate(row))
         has_lost_point = text[0] == "0" and len(text) > 1 and text[1] != "."
-        line = _Line.of(found.boxes[row])
+        line = Line.of(found.boxes[row])
         if len(points) > 1 or has_lost_point or _is_part(found.boxes, likely, line):
             continue
-        text = "-" * _has_minus(found.boxes, line) + text
-        angle_rad, off = place(np.array(0.5 * (line.left + line.right)), np.array(line.level))
-        if RING[0] < off < RING[1]:
-            yield Number(
-                value=float(text), text=text, angle_rad=float(angle_rad), off=float(off), height=line.tall / RADIUS_PX,
-                probability=float(np.prod(likely[row])),
-            )  # fmt: skip
+        yield "-" * _has_minus(found.boxes, line) + text, line, float(np.prod(likely[row]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Line:
+class Line:
     """The room of a number, px: its left and right end, the middle of its height, and its height."""
 
     left: float
@@ -155,9 +163,9 @@ class _Line:
     tall: float
 
     @staticmethod
-    def of(boxes: Array) -> _Line:
+    def of(boxes: Array) -> Line:
         x, y, w, h = boxes.T
-        return _Line(
+        return Line(
             left=float(x[0]), right=float(x[-1] + w[-1]), level=float(np.mean(y + h / 2)), tall=float(np.median(h))
         )
 
@@ -173,7 +181,7 @@ def _row(boxes: Array, first: int, is_digit: Array) -> tuple[list[int], list[int
     return row, points
 
 
-def _is_part(boxes: Array, likely: Array, line: _Line) -> bool:
+def _is_part(boxes: Array, likely: Array, line: Line) -> bool:
     """Return whether a letter stands beside a number, or a digit so near that a point between them was not seen."""
     x, y, w, h = boxes.T
     off_level, gap = np.abs(y + h / 2 - line.level), np.maximum(x - line.right, line.left - x - w) / line.tall
@@ -201,7 +209,7 @@ def _following(boxes: Array, last: int, is_digit: Array) -> tuple[int, bool] | N
     return (after, False) if gap[after] < FARTHEST else None
 
 
-def _has_minus(boxes: Array, line: _Line) -> bool:
+def _has_minus(boxes: Array, line: Line) -> bool:
     """Return whether a short bar stands before a number."""
     x, y, w, h = boxes.T
     is_bar = (h < MINUS_TALL * line.tall) & (w > MINUS_WIDE[0] * line.tall) & (w < MINUS_WIDE[1] * line.tall)

@@ -1,4 +1,4 @@
-"""Reader of displays in photographs: seven-segment digits or the drums of a counter, cropped or somewhere in a scene."""
+"""Reader of displays in photographs: seven segments, dots, or the drums of a counter, cropped or somewhere in a scene."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hal.arrays import Image
 from perception.vision.image import as_gray
 from perception.vision.photographs.digit_search import DigitRow, find_digit_rows
+from perception.vision.photographs.dot_matrix import read_dots
 from perception.vision.photographs.drum_search import read_counter_in
 from perception.vision.reading import ANSWER_AT, PatchReading, answer_at, gated, limited, refused
 from perception.vision.status.digit_grid_worth import slant_energies
@@ -26,6 +27,7 @@ RIVAL = 0.3  # weight of other texts read nearby, which lower the confidence
 ROW = 0.35  # weight, relative to that of a crop's reading, of a row of digits in it with another text
 FEW, FEW_OF_SCENE = 4.0, 5.6  # numbers of segments, see `_agreed`; in scenes fewer segments give less confidence
 OF_DRUMS = 0.75  # highest confidence of a counter, whose number of drums is not known
+OF_DOTS = 0.75  # highest confidence of a number of dots, whose minus or point may not be seen
 FRAME = 0.08  # of a crop's height, which a frame may cover
 
 
@@ -41,16 +43,23 @@ def read_photographed_display(image: NDArray[Any], *, scene: bool, least_confide
         InvalidRequest, NotObservable: bad image.
     """
     gray = as_gray(image)
-    rows = [(share, answer) for window in _rows(gray) for share, answer in _read(window)]
-    answers = rows if scene else _with_rows([pair for window in _crops(gray) for pair in _read(window)], rows)
-    seven = _agreed(answers, FEW_OF_SCENE if scene else FEW) if answers else None
+    seven = read_segments(gray, scene=scene)
     found = [] if seven is None else [seven]
     if seven is None or not (seven.answered and seven.confidence > OF_DRUMS):
         counter = read_counter_in(gray)
         found += [] if counter is None else [limited(counter, OF_DRUMS)]
+        dots = read_dots(gray, is_scene=scene)
+        found += [] if dots is None else [limited(dots, OF_DOTS)]
     if not found:
         return refused("no display is found in the picture: crop it, or come closer")
     return answer_at(max(found, key=lambda answer: answer.confidence), least_confidence)
+
+
+def read_segments(gray: Image, *, scene: bool) -> PatchReading | None:
+    """Return the reading of the seven-segment digits in a picture (H, W), or the likeliest refusal; None without any."""
+    rows = [(share, answer) for window in _rows(gray) for share, answer in _read(window)]
+    answers = rows if scene else _with_rows([pair for window in _crops(gray) for pair in _read(window)], rows)
+    return _agreed(answers, FEW_OF_SCENE if scene else FEW) if answers else None
 
 
 def _read(place: tuple[Image, bool | None, float]) -> list[tuple[float, PatchReading]]:

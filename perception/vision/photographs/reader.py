@@ -1,14 +1,17 @@
-"""Reader of one instrument in a photograph, if only its kind is known, and perhaps its scale."""
+"""Reader of one instrument in a photograph, of which nothing need be known: neither place, nor kind, nor scale."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Image
 from hal.errors import InvalidRequest
 from perception.vision.image import check_image
+from perception.vision.photographs.anywhere import read_anything, read_face_anywhere
 from perception.vision.photographs.dial import read_by_numerals, read_dial
 from perception.vision.photographs.hands import Pointer
 from perception.vision.photographs.photo_display import read_photographed_display
@@ -19,7 +22,7 @@ PhotographKind = Literal["gauge", "dial", "display"]
 
 def read_photograph(
     image: NDArray[Any],
-    kind: PhotographKind,
+    kind: PhotographKind | None = None,
     *,
     scale: tuple[float, float] | None = None,
     ends_rad: tuple[float, float] | None = None,
@@ -29,40 +32,61 @@ def read_photograph(
 ) -> PatchReading:
     """Read the instrument that fills a photograph, or is somewhere in it.
 
+    A round face may be seen aslant by up to 50 degrees. A picture of several instruments is refused.
+
     Args:
         image: (H, W) gray or (H, W, 3) RGB uint8.
         kind: `gauge`: a pointer over a part of a turn; `dial`: a pointer over a full turn that begins straight up, as
-            in a water meter; `display`: seven-segment digits, or the drums of a counter.
+            in a water meter; `display`: seven-segment digits, or the drums of a counter. None: whichever is found
+            anywhere in the picture.
         scale: values at the ends of a gauge's or a dial's scale, in the clockwise sense; the first is the greater one
             where the values fall clockwise. Without it a gauge is read by its numerals.
         ends_rad: pointer angles of a gauge there, clockwise from straight up. If None, they are the ends of the ticks,
             or three quarters of a turn if these are not found.
         pointer: which pointer is read where a red one stands beside another one; `black` is the one that is not red.
-        is_scene: whether the display is somewhere in the picture, not cropped. The dial of a pointer must fill it.
+        is_scene: whether an instrument whose kind is told is somewhere in the picture, not cropped.
         least_confidence: 0 to 1; less certain readings are refused, with a guess.
 
     Raises:
         InvalidRequest: a scale is missing, or given for a kind that has none; a bad image.
         NotObservable: the image is black or saturated.
     """
-    _check(kind, scale=scale, ends_rad=ends_rad, pointer=pointer, is_scene=is_scene)
+    _check(kind, scale=scale, ends_rad=ends_rad, pointer=pointer)
     check_image(image)
     if kind == "display":
         return read_photographed_display(image, scene=is_scene, least_confidence=least_confidence)
+    read = partial(
+        _read_face, is_turn=kind == "dial", scale=scale, ends_rad=ends_rad, pointer=pointer, least_confidence=least_confidence
+    )  # fmt: skip
+    if kind is None and scale is None and pointer is None:
+        return read_anything(image, read, least_confidence)
+    if kind is None or is_scene:
+        return read_face_anywhere(image, read, is_scene=is_scene)
+    filling = read(image)
+    if filling.answered or filling.pointers:  # several pointers need a word of the caller
+        return filling
+    found = read_face_anywhere(image, read, is_scene=True)
+    return found if found.answered else filling
+
+
+def _read_face(
+    image: Image, *, is_turn: bool, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None,
+    pointer: Pointer | None, least_confidence: float,
+) -> PatchReading:  # fmt: skip
+    """Read the dial that fills a picture, by its numerals if its scale is not told."""
     if scale is None:
         return read_by_numerals(image, pointer=pointer, least_confidence=least_confidence)
-    low, high = scale
     return read_dial(
-        image, minimum=low, maximum=high, circular=kind == "dial", ends_rad=ends_rad, pointer=pointer,
+        image, minimum=scale[0], maximum=scale[1], circular=is_turn, ends_rad=ends_rad, pointer=pointer,
         least_confidence=least_confidence,
     )  # fmt: skip
 
 
 def _check(
-    kind: PhotographKind, *, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None,
-    pointer: Pointer | None, is_scene: bool,
+    kind: PhotographKind | None, *, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None,
+    pointer: Pointer | None,
 ) -> None:  # fmt: skip
-    """Check that scale, ends, pointer and scene suit the kind.
+    """Check that scale, ends and pointer suit the kind.
 
     Raises:
         InvalidRequest: they do not.
@@ -74,8 +98,6 @@ def _check(
                 hint="leave scale, ends and pointer out, or say which kind it is",
             )
         return
-    if is_scene:
-        raise InvalidRequest(f"a {kind} is not looked for in a scene", hint="crop the picture to the instrument")
     if scale is None:
         if kind == "dial":
             raise InvalidRequest("a dial is read by its scale", hint="give the values of one turn, for example 0 to 10")

@@ -75,25 +75,6 @@ def test_a_long_or_broken_source_is_cut_not_refused(tmp_path: Path) -> None:
     assert latch.set("\ud800").is_latched
 
 
-def test_a_stop_port_that_ends_leaves_no_traceback_of_an_open_connection(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    listener = socket.create_server(("127.0.0.1", 0))
-    client = socket.create_connection(listener.getsockname())
-
-    async def serve_until_connected() -> None:
-        server = await StopServer(Latch.create(tmp_path / "latch")).start(listener)
-        while not server.sockets or not _waiting():
-            await asyncio.sleep(0)
-
-    def _waiting() -> bool:
-        return any("_serve" in repr(task) for task in asyncio.all_tasks())
-
-    asyncio.run(serve_until_connected())
-    client.close()
-    assert not [record for record in caplog.records if record.levelname == "ERROR"]
-
-
 def test_stops_of_several_threads_are_all_counted(tmp_path: Path) -> None:
     latch = Latch.create(tmp_path / "latch")
     before = latch.state().count

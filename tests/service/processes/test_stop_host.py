@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import signal
@@ -21,6 +22,7 @@ from manipulation.control.way_back import LONGEST_S
 from service.processes import cell, stop
 from service.processes.beat import Beat, every_beat
 from service.processes.latch import UNREADABLE, Latch, StopLevel
+from service.processes.stop import StopServer
 from service.processes.stop_host import ProcessStop, bound_socket
 from tests.service.waiting import eventually
 
@@ -187,3 +189,22 @@ def test_a_latch_whose_writer_hangs_in_mid_write_is_set_directly(
     monkeypatch.setattr(latch, "set", lambda source, _level: set_here.append(source))
     host.stop("a person")
     assert set_here == ["a person"]
+
+
+def test_a_stop_port_that_ends_leaves_no_traceback_of_an_open_connection(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+    client = socket.create_connection(listener.getsockname())
+
+    async def serve_until_connected() -> None:
+        await StopServer(Latch.create(tmp_path / "latch")).start(listener)
+        for _ in range(1000):
+            if any("_serve" in repr(task) for task in asyncio.all_tasks()):
+                return
+            await asyncio.sleep(0)
+        raise AssertionError("no connection was accepted")
+
+    asyncio.run(serve_until_connected())
+    client.close()
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]

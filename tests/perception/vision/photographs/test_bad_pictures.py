@@ -13,7 +13,8 @@ from benchmarks.photographs import METER_NUMERAL
 from benchmarks.vision_dials import draw_dial
 from benchmarks.vision_manometers import draw_manometer
 from hal.errors import InvalidRequest
-from perception.vision import PhotographKind, read_photograph
+from perception.vision import read_photograph
+from perception.vision.photographs.reader import PhotographKind
 
 SURE = 0.8
 GAUGE = draw_manometer(200003).image
@@ -53,6 +54,13 @@ def test_what_is_no_upright_instrument_is_refused_or_not_sure(name: str, kind: P
 @pytest.mark.parametrize("name", PICTURES)
 def test_what_is_no_upright_gauge_has_no_sure_scale_either(name: str) -> None:
     told = read_photograph(PICTURES[name], "gauge")
+    assert told.confidence < SURE
+    assert (told.value is None) == bool(told.reason)
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_where_nothing_is_told_nothing_wrong_is_sure(name: str) -> None:
+    told = read_photograph(PICTURES[name])
     assert told.confidence < SURE
     assert (told.value is None) == bool(told.reason)
 

@@ -46,7 +46,6 @@ def test_a_display_is_read() -> None:
         ("gauge", {"scale": (0.0, 1.0), "ends_rad": (-135.0, 135.0)}, "rad cannot be"),
         ("gauge", {"scale": (0.0, 1.0), "ends_rad": (1.0, 1.0)}, "rad cannot be"),
         ("dial", {"scale": (0.0, 1.0), "ends_rad": (-1.0, 1.0)}, "full turn"),
-        ("gauge", {"scale": (0.0, 1.0), "is_scene": True}, "scene"),
         ("display", {"scale": (0.0, 1.0)}, "no scale"),
     ],
 )

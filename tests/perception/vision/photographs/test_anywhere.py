@@ -1,0 +1,112 @@
+"""An instrument somewhere in an ordinary picture: found, told apart, read; several or none are refused with a reason."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.display_drawing import draw_photograph
+from benchmarks.photograph_scenes import draw_scene, draw_without
+from benchmarks.photographs import METER_NUMERAL, printed_way
+from benchmarks.vision_dials import draw_dial
+from perception.vision import read_photograph
+from perception.vision.photographs.anywhere import NOTHING
+from perception.vision.photographs.faces import find_faces
+from perception.vision.photographs.numeral_scale import PrintedScale
+
+SURE = 0.8
+SCENES = range(700, 712)
+
+
+def test_faces_are_found_where_they_are_drawn_also_aslant() -> None:
+    found = 0
+    for seed in SCENES:
+        scene = draw_scene(seed, printed_way(seed))
+        off = [np.hypot(*(face.middle - scene.middle_px)) / scene.width_px for face in find_faces(scene.image)]
+        found += min(off, default=1.0) < 0.12
+    assert found >= len(SCENES) - 2
+
+
+def test_the_view_of_a_face_shows_a_circle_from_straight_ahead() -> None:
+    picture = np.full((480, 640, 3), 90, np.uint8)
+    cv2.ellipse(picture, (350, 200), (120, 85), 30.0, 0.0, 360.0, (235, 235, 230), -1, cv2.LINE_AA)
+    (face,) = find_faces(picture)
+    assert face.middle == pytest.approx([350, 200], abs=1.0)
+    assert np.linalg.svd(face.rim)[1] == pytest.approx([120, 85], abs=1.5)
+    view, image_from_view = face.view(picture)
+    middle = (len(view) - 1) / 2
+    assert (image_from_view @ [middle, middle, 1.0])[:2] == pytest.approx(face.middle, abs=0.5)
+    bright = np.argwhere(view[:, :, 0] > 160)
+    assert np.ptp(bright[:, 0]) == pytest.approx(np.ptp(bright[:, 1]), abs=4.0)
+
+
+def test_gauges_anywhere_are_read_with_their_kind_place_and_scale() -> None:
+    right = wrong = 0
+    for seed in SCENES:
+        scene = draw_scene(seed, printed_way(seed))
+        told = read_photograph(scene.image)
+        if told.value is None:
+            assert told.reason
+            continue
+        good = abs(told.value - scene.reading / 10 * scene.full) < 0.025 * scene.full
+        assert good or told.confidence < SURE
+        right, wrong = right + good, wrong + (not good)
+        if good:
+            assert told.scale is not None and 0.8 * scene.full < told.scale.maximum <= scene.full  # of its numbers
+            assert (
+                told.face is not None
+                and np.hypot(*np.subtract(told.face.middle, scene.middle_px)) < 0.12 * scene.width_px
+            )
+    assert right >= 3 and wrong <= 1
+
+
+def test_where_no_instrument_is_none_is_read() -> None:
+    for seed in range(720, 728):
+        told = read_photograph(draw_without(seed))
+        assert told.confidence < SURE and (told.reason is None) == (told.value is not None)
+    assert read_photograph(np.full((200, 300, 3), 120, np.uint8)).reason == NOTHING
+
+
+def test_two_instruments_are_refused_with_their_places() -> None:
+    both = []
+    for seed in range(995000, 995100):
+        way = printed_way(seed)
+        image = cv2.resize(draw_scene(seed, way).image, (800, 600))
+        if read_photograph(np.hstack([image, np.full_like(image, 90)])).confidence > SURE:
+            both.append(image)
+        if len(both) == 2:
+            break
+    told = read_photograph(np.hstack(both))
+    assert not told.answered and told.reason is not None and "2 instruments" in told.reason and "pixel" in told.reason
+
+
+def test_a_display_is_told_from_a_face() -> None:
+    drawn = draw_photograph(3, "cropped")
+    told = read_photograph(drawn.image)
+    assert told.text == drawn.text and told.face is None
+
+
+def test_a_full_turn_is_read_by_its_numerals() -> None:
+    read = 0
+    for seed in range(200000, 200012):
+        drawn = draw_dial(seed, circular=True, numeral=METER_NUMERAL)
+        told = read_photograph(drawn.image)
+        if told.value is None:
+            continue
+        off = abs(told.value - drawn.reading) % 10.0
+        assert min(off, 10.0 - off) < 0.3 or told.confidence < SURE
+        read += told.scale is not None and told.scale.maximum == 10.0
+    assert read >= 2
+
+
+@pytest.mark.parametrize(
+    ("ends", "turn"),
+    [((0.0, 9.0, 0.0, 324.0), 10.0), ((1.0, 9.0, -36.0, -324.0), -10.0), ((0.0, 9.0, -135.0, 135.0), None)],
+)
+def test_a_scale_that_closes_is_a_full_turn(ends: tuple[float, ...], turn: float | None) -> None:
+    low, high, first, last = ends
+    scale = PrintedScale(
+        minimum=low, maximum=high, at_min=np.deg2rad(first), at_max=np.deg2rad(last), step=1.0, off=0.7, numbers=9, lacking=0
+    )  # fmt: skip
+    assert scale.full_turn() == turn

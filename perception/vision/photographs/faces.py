@@ -37,7 +37,7 @@ SAME_MIDDLE = 0.25  # of the larger face's size: faces with middles as near are 
 WHOLE = 0.85  # least coverage of a face, relative to the best one of its instrument
 MARGIN = 1.12  # radius of the view of a face over the face's
 MOST_VIEW_PX = 900
-MOST_FACES = 6
+MOST_GROUPS, MOST_FACES = 20, 6
 CAP_PX = 150.0  # radius of the view in which the pivot's cap is searched
 CAP_RADII, CAP_WITHIN = (0.045, 0.2), 0.22  # shares of the face's radius: of the cap, and its distance from the middle
 CAP_SIGMA_PX = 1.2
@@ -102,7 +102,7 @@ def moving_to_middle(point: tuple[float, float]) -> Array:
 
 
 def find_faces(image: NDArray[np.uint8]) -> list[Face]:
-    """Return the round faces in a picture, the most complete ones first, one for each instrument, at most MOST_FACES.
+    """Return the round faces in a picture, those with a cap first, one for each instrument, at most MOST_FACES.
 
     Args:
         image: (H, W) gray or (H, W, 3) RGB uint8.
@@ -204,19 +204,19 @@ def _coverage(edges: Edges, middle: Array, rim: Array) -> float:
 
 
 def _of_each_instrument(gray: Image, found: list[Face]) -> list[Face]:
-    """Return of each group of concentric outlines the largest of the complete ones, the most complete groups first.
+    """Return of each group of concentric outlines the largest of the complete ones; those with a cap come first.
 
-    The face of an instrument has a rim around it, and rings on it. Outlines with a cap in their middle come first.
+    The face of an instrument has a rim around it, and rings on it.
     """
     kept: list[Face] = []
     left = sorted(found, key=lambda face: -face.coverage)
-    while left and len(kept) < MOST_FACES:
+    while left and len(kept) < MOST_GROUPS:
         best = left[0]
         group = [face for face in left if _is_about(face, best)]
         whole = [_with_cap(gray, one) for one in group if one.coverage >= WHOLE * best.coverage]
         kept.append(max(whole, key=lambda one: (one.has_cap, one.size_px)))
         left = [face for face in left if not _is_about(face, kept[-1]) and not _is_about(face, best)]
-    return kept
+    return sorted(kept, key=lambda face: (not face.has_cap, -face.coverage))[:MOST_FACES]
 
 
 def _is_about(one: Face, other: Face) -> bool:

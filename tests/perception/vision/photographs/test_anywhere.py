@@ -10,6 +10,7 @@ from benchmarks.display_drawing import draw_photograph
 from benchmarks.photograph_scenes import draw_scene, draw_without
 from benchmarks.photographs import METER_NUMERAL, printed_way
 from benchmarks.vision_dials import draw_dial
+from benchmarks.vision_manometers import draw_manometer
 from perception.vision import read_photograph
 from perception.vision.photographs.anywhere import NOTHING
 from perception.vision.photographs.faces import find_faces
@@ -70,13 +71,10 @@ def test_where_no_instrument_is_none_is_read() -> None:
 
 def test_two_instruments_are_refused_with_their_places() -> None:
     both = []
-    for seed in range(995000, 995100):
-        way = printed_way(seed)
-        image = cv2.resize(draw_scene(seed, way).image, (800, 600))
-        if read_photograph(np.hstack([image, np.full_like(image, 90)])).confidence > SURE:
-            both.append(image)
-        if len(both) == 2:
-            break
+    for seed in (995000, 995005):
+        gauge = cv2.resize(draw_manometer(seed, printed_way(seed)).image, (400, 400))
+        both.append(cv2.copyMakeBorder(gauge, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=(90, 90, 90)))
+        assert read_photograph(both[-1]).confidence > 0.7
     told = read_photograph(np.hstack(both))
     assert not told.answered and told.reason is not None and "2 instruments" in told.reason and "pixel" in told.reason
 

@@ -54,11 +54,9 @@ def read_anything(image: Image, read: ReadFace, least_confidence: float) -> Patc
     rest = _without([one.face for one in seen if one.reading.answered or one.face.is_clear], as_gray(image))
     if face is None or not face.answered:
         display = _display(rest, (True, False))
-        return (
-            (face or refused(NOTHING))
-            if display is None
-            else answer_at(limited(display, DISPLAY_MOST), least_confidence)
-        )
+        if display is None:
+            return face or refused(NOTHING)
+        return answer_at(limited(display, DISPLAY_MOST), least_confidence)
     beside = _display(rest, (True,))
     return face if beside is None else doubted(face, _several([_told(face), f"a display with {beside.text}"]))
 
@@ -138,5 +136,6 @@ def _without(faces: Sequence[Face], image: Image) -> Image:
         rim = face.middle + 1.05 * (face.rim @ np.array([np.sin(turns), np.cos(turns)])).T
         inside = np.zeros(image.shape[:2], np.uint8)
         cv2.fillPoly(inside, [np.rint(rim).astype(np.int32)], 1)
-        rest[inside > 0] = np.median(image[inside > 0], axis=0).astype(np.uint8)
+        if inside.any():
+            rest[inside > 0] = np.uint8(np.median(image[inside > 0]))
     return rest

@@ -142,6 +142,7 @@ def test_calls_that_change_something_ask_the_lease_or_say_why_not() -> None:
         "POST /v1/session",  # about the caller alone
         "DELETE /v1/session",
         "POST /v1/knowledge/outline",  # writes nothing
+        "POST /v1/read",
         "POST /v1/read-photograph",
         "POST /v1/review/{reading}",  # about the past
         "POST /v1/mission-files/check",  # writes nothing

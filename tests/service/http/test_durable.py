@@ -131,7 +131,7 @@ OTHERS = {
     "POST /v1/lease/heartbeat",  # a lease does not outlive the service
     "POST /v1/tasks/{task_id}/cancel",  # the end of its task is recorded; a task that was cut off is not taken up
     "POST /v1/tasks/{task_id}/pause", "POST /v1/tasks/{task_id}/go-on",  # tests/service/tasks/test_between_motions.py
-    "POST /v1/knowledge/outline", "POST /v1/read-photograph", "POST /v1/mission-files/check",  # they change nothing
+    "POST /v1/knowledge/outline", "POST /v1/read", "POST /v1/read-photograph", "POST /v1/mission-files/check",  # change nothing
     "PUT /v1/limits/{object}",  # as DELETE; the lamp of these tests has no limits that could be set
     "POST /v1/knowledge/teach",  # tests/service/http/test_knowledge.py
     "POST /v1/review/{reading}/teach",  # tests/service/review/test_review.py

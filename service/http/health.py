@@ -31,7 +31,8 @@ async def healthz() -> HealthzView:
 )
 async def readyz(state: State) -> JSONResponse:
     service = state.service
-    supervisor, is_running = service.supervisor, service.supervisor.is_ready
+    supervisor, processes = service.supervisor, service.supervisor.processes()
+    is_running = supervisor.is_ready and all(process.is_alive for process in processes)
     missing = [MissingView(**asdict(one), lost=list(service.lost_without(one.device))) for one in supervisor.missing]
     view = ReadyView(
         is_ready=is_running and not missing and service.journal_watch.problem is None,
@@ -39,7 +40,7 @@ async def readyz(state: State) -> JSONResponse:
         missing=missing,
         lacking={verb: list(devices) for verb, devices in service.lacking().items()},
         journal_problem=service.journal_watch.problem,
-        processes=[ProcessView(**asdict(process)) for process in supervisor.processes()],
+        processes=[ProcessView(**asdict(process)) for process in processes],
     )
     return JSONResponse(view.model_dump(mode="json"), 200 if is_running else 503)
 

@@ -322,9 +322,9 @@ class ReadyView(BaseModel):
     """Whether the cell is ready for everything, and otherwise for what.
 
     `is_ready` is true when the cell runs, no device is missing and the journal can record. `is_running` is true when the cell
-    runs, even if devices are missing; it decides the status, 200 or 503. `lacking` has for each verb the missing devices that
-    it may need: a verb with none is ready, and one with some may fail, depending on the request. `journal_problem` says why
-    nothing can be recorded, so that nothing may move.
+    and the stop process run, even if devices are missing; it decides the status, 200 or 503. `lacking` has for each verb the
+    missing devices that it may need: a verb with none is ready, and one with some may fail, depending on the request.
+    `journal_problem` says why nothing can be recorded, so that nothing may move.
     """
 
     is_ready: bool

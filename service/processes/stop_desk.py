@@ -28,7 +28,7 @@ class StopHost(Protocol):
         """Clear the latch unless it was set again after `seen_count`; returns whether it is clear.
 
         Raises:
-            MotionRefused: the stop process did not answer.
+            MotionRefused: the stop process does not run or did not answer.
         """
         ...
 
@@ -136,14 +136,17 @@ class StopDesk:
         self.note_stop()  # before the reset overwrites the latch's record
         if seen_count is None:
             seen_count = self._count_of_old_stop()
-        if not self._host.is_alive():
-            raise MotionRefused("the stop process is down, so nothing may move", hint="restart `panelwright serve`")
         state = self._latch.state()
         if not state.is_latched and state.count == seen_count:
             return state
         told = {"source": source, "count": seen_count}
         self._records.commit("stop-reset", told)
-        if not self._host.reset(source, seen_count=seen_count):
+        try:
+            is_clear = self._host.reset(source, seen_count=seen_count)
+        except MotionRefused:
+            self._records.note("stop-reset-refused", told)
+            raise
+        if not is_clear:
             self._records.note("stop-reset-refused", told)
             raise MotionRefused(
                 f"the stop was pressed again or reset since count {seen_count}, so this reset does nothing",

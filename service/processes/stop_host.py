@@ -24,7 +24,7 @@ STOP_ANSWER_S = 0.5  # after this, the latch is set from this process
 RESET_ANSWER_S = 5.0  # generous, because a busy machine answers late
 READY_S = 20.0
 LOST_S = 0.5  # a stop process that gives no heartbeat for so long after it was noticed is killed and started again
-PAUSES_S = (0.0, 0.0, 0.5, 1.0, 2.0, 5.0)  # before a restart, by the number of short lives in a row
+PAUSES_S = (0.0, 0.0, 0.5, 1.0, 2.0)  # before a restart, by the number of short lives in a row
 SHORT_LIFE_S = 10.0
 log = logging.getLogger(__name__)
 
@@ -155,11 +155,15 @@ class ProcessStop:
         """Ask the stop process to clear the latch; it refuses if the latch was set again after `seen_count`.
 
         Raises:
-            MotionRefused: it did not answer in time; a late answer clears nothing.
+            MotionRefused: it does not run, or did not answer in time; a late answer clears nothing.
         """
         if self._readable(STOP_ANSWER_S).count != seen_count:
             return False
-        self._is_ready.wait(RESET_ANSWER_S)
+        if not self._is_ready.wait(RESET_ANSWER_S):
+            raise MotionRefused(
+                "the stop process is down and is being started again, so the stop stays latched",
+                hint="wait until GET /readyz says that the cell is running, then reset again",
+            )
         is_told = self._child.write_line(f"reset {seen_count} {_line(source)}")
         if not (is_told and self._has_changed(seen_count, RESET_ANSWER_S)):
             self._latch.set("a reset without an answer")  # raises the count, so that a late reset is refused
@@ -171,8 +175,8 @@ class ProcessStop:
         return not now.is_latched and now.count == seen_count + 1
 
     def is_alive(self) -> bool:
-        """Whether the process is running and gives its heartbeat."""
-        return self.lost() is None
+        """Whether the process has said that it is ready, is running and gives its heartbeat."""
+        return self._is_ready.is_set() and self.lost() is None
 
     @property
     def restarts(self) -> int:

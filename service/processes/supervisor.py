@@ -200,11 +200,11 @@ class Supervisor:
         alive = self._local is not None or (child is not None and child.is_alive())
         detail = self._problem.what if self._problem is not None else ""
         pid = None if child is None else child.pid
+        stop, can_stop = self._stop, self._stop.is_alive()
+        no_stop = "" if can_stop else "the stop process is being started"
         return (
             ProcessHealth(name="cell", pid=pid, is_alive=alive, restarts=self._restarts, detail=detail),
-            ProcessHealth(
-                name="stop", pid=self._stop.pid, is_alive=self._stop.is_alive(), restarts=self._stop.restarts
-            ),
+            ProcessHealth(name="stop", pid=stop.pid, is_alive=can_stop, restarts=stop.restarts, detail=no_stop),
         )
 
     def close(self) -> None:

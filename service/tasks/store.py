@@ -261,11 +261,12 @@ class TaskStore:
             task.wait(max(0.0, end_s - time.monotonic()))
 
     def _run(self, task: Task, work: Work) -> None:
-        if not task.move_to(TaskState.RUNNING):
-            self._record_end(task)  # cancelled while it waited
-            return
         try:
-            self._recorder.append("task-started", {"task": task.id})
+            if task.state is TaskState.QUEUED:  # recorded before anybody sees that it runs
+                self._recorder.append("task-started", {"task": task.id})
+            if not task.move_to(TaskState.RUNNING):
+                self._record_end(task)  # cancelled while it waited
+                return
             result = jsonable(work(TaskContext(task, self._folder / task.id)))
         except Cancelled as error:
             self._end(task, TaskState.CANCELLED, error=error)

@@ -63,6 +63,15 @@ class Scene:
     def reset(self) -> None:
         self.supervisor.reset("test", seen_count=self.supervisor.latch.state().count)
 
+    def is_clear_by_reset(self) -> bool:
+        """Reset; a loss latches the stop twice, and a reset between the two is rightly refused."""
+        try:
+            self.reset()
+        except MotionRefused as error:
+            if "pressed again" not in error.what:
+                raise
+        return not self.supervisor.latch.is_set()
+
 
 @pytest.fixture
 def scene(write_cell: WriteCell, tmp_path: Path) -> Iterator[Scene]:
@@ -87,6 +96,16 @@ def test_a_suspended_stop_process_latches_the_stop_and_is_replaced(scene: Scene)
     assert scene.supervisor.latch.is_set(), "a restart alone must not free the arm"
     scene.reset()
     assert not scene.supervisor.latch.is_set()
+
+
+def test_a_reset_waits_for_a_stop_process_that_pauses_before_its_next_start(scene: Scene) -> None:
+    """The second of two short lives in a row is followed by a pause, in which resets were refused."""
+    for kills in (1, 2):
+        first = scene.pid("stop")
+        os.kill(first, signal.SIGKILL)
+        eventually(lambda: scene.is_latched_by("the stop process"), timeout_s=SOON_S)
+        eventually(scene.is_clear_by_reset, timeout_s=SOON_S)
+        assert scene.process("stop").restarts == kills
 
 
 def test_resets_that_wait_for_a_suspended_stop_process_delay_no_stop(scene: Scene) -> None:

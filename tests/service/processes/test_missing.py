@@ -61,6 +61,19 @@ def serve(write_cell: WriteCell, trouble: Path, tmp_path: Path) -> Iterator[Serv
         panel_object.close()
 
 
+def test_a_cell_without_its_stop_process_is_not_running(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its resets are refused, so whoever waits until the cell is ready must wait for the stop process as well."""
+    monkeypatch.setattr("service.processes.stop_host.PAUSES_S", (60.0,))
+    http = serve(inline=False)
+    eventually(lambda: http.get("/readyz").status_code == 200)
+    stop = next(each for each in http.get("/readyz").json()["processes"] if each["name"] == "stop")
+    os.kill(stop["pid"], signal.SIGKILL)
+    eventually(lambda: http.get("/readyz").status_code == 503)
+    ready = http.get("/readyz").json()
+    assert (ready["is_running"], ready["is_ready"]) == (False, False)
+    assert [each["detail"] for each in ready["processes"]] == ["", "the stop process is being started"]
+
+
 def test_what_is_missing_is_named_and_the_rest_works(serve: Serve, trouble: Path) -> None:
     http = serve("panel_lights", "finger_proximity", inline=False)
     ready = http.get("/readyz")

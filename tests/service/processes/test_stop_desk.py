@@ -13,7 +13,7 @@ from service.processes.stop_desk import Records, StopDesk
 
 
 class Host:
-    """Writes the latch at once; `alive` says whether its port answers."""
+    """Writes the latch at once, unless it is not `alive`."""
 
     pid = None
 
@@ -25,6 +25,8 @@ class Host:
         return self.latch.set(source, level)
 
     def reset(self, source: str, *, seen_count: int) -> bool:
+        if not self.alive:
+            raise MotionRefused("the stop process is down", hint="wait")
         return self.latch.reset(source, seen_count=seen_count)
 
     def is_alive(self) -> bool:
@@ -48,13 +50,19 @@ def test_a_reset_without_a_count_clears_no_stop_of_this_moment(latch: Latch) -> 
     assert not desk.reset("test", seen_count=latch.state().count).is_latched
 
 
-def test_no_reset_without_a_stop_port(latch: Latch) -> None:
+def test_a_reset_without_a_stop_port_is_refused_and_recorded_as_refused(latch: Latch) -> None:
     host = Host(latch)
-    desk = StopDesk(latch, host, Records())
+    recorded: list[str] = []
+
+    def told(kind: str, _data: object) -> None:
+        recorded.append(kind)
+
+    desk = StopDesk(latch, host, Records(note=told, commit=told))
     host.alive = False
     with pytest.raises(MotionRefused, match="stop process is down"):
         desk.reset("test", seen_count=desk.stop("a person").count)
     assert latch.is_set()
+    assert recorded == ["stop", "stop-reset", "stop-reset-refused"]
 
 
 def test_a_reset_of_a_clear_stop_is_no_change_that_could_end_a_task(latch: Latch) -> None:

@@ -15,6 +15,7 @@ from service.chaos.options import ChaosOptions, Round
 from service.chaos.plant import Plant
 from service.chaos.watch import Watch
 from service.client import FINAL
+from service.schema.mission_results import REPORTING
 
 START_S = 400.0  # the first start may compile kernels
 BACK_S = 60.0  # a service that is not ready after this long counts as lost
@@ -130,15 +131,20 @@ class Chaos:
             has_ended = has_ended or self._state(task_id) in FINAL
             return (fault.latches or fault.ends) and has_latched >= fault.latches and has_ended >= fault.ends
 
-        was_final = self._state(task_id) == "succeeded"
+        was_over = self._is_over(task_id, fault)
         if self._await(has_followed, self._options.patience * fault.lasts_s):
             done.followed_s = time.monotonic() - begun_s
         if fault.latches and not has_latched:
             done.breaches.append(f"the stop was not latched within {fault.lasts_s:.0f} s")
-        if fault.ends and not was_final and (not has_ended or self._state(task_id) == "succeeded"):
+        if fault.ends and not was_over and (not has_ended or self._state(task_id) == "succeeded"):
             done.breaches.append(f"the task went on for {fault.lasts_s:.0f} s as if nothing had happened")
         if not fault.latches:
             self._stop_meanwhile(done, fault)
+
+    def _is_over(self, task_id: str, fault: ChaosFault) -> bool:
+        """Return whether a task has succeeded, or only its report is left, which a fault that ends motions need not end."""
+        task = self._plant.state_of(task_id) or {}
+        return task.get("state") == "succeeded" or (fault.latches and task.get("step") == REPORTING)
 
     def _stop_meanwhile(self, done: Round, fault: ChaosFault) -> None:
         """Stop at the stop port while the fault lasts, in every second round."""

@@ -57,7 +57,7 @@ from service.report.record import MissionRecord, Picture
 from service.report.write import write_report
 from service.schema.mission_file import FeelStep, InspectStep, SetStep
 from service.schema.mission_request import MissionRequest
-from service.schema.mission_results import MissionResult, StepResult, SurfaceCheck
+from service.schema.mission_results import REPORTING, MissionResult, StepResult, SurfaceCheck
 from service.schema.requests import ActionBody, WantedPose
 from service.schema.results import FittedPlate, FoundBy, estimated
 
@@ -167,6 +167,7 @@ def _run(worker: _Worker, interpreter: Interpreter) -> None:
     with _step(session, "retreat", WORKED, 1.0) as part:
         part.progress(0.0, "park")
         park(part)
+    session.progress(1.0, REPORTING)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

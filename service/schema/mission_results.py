@@ -7,6 +7,9 @@ from typing import Literal
 from service.schema.fuse_results import FuseResult
 from service.schema.results import Numbers, Pictures, Result
 
+REPORTING = "write the report"
+"""The step of a mission's task from which on nothing moves any more."""
+
 
 class ReadingResult(Result):
     """One reading of an object during a mission; `shows` is the same as text."""

@@ -20,6 +20,7 @@ from service.chaos.plant import Plant
 from service.chaos.run import Chaos
 from service.chaos.table import report, write
 from service.chaos.watch import BACK_S, REST_S, STILL_RAD, Sight, motions_while_latched
+from service.schema.mission_results import REPORTING
 from service.tasks.journal_reader import Record
 from tests.service.conftest import WriteCell
 from tests.service.verbs import EchoRequest
@@ -122,6 +123,26 @@ def test_the_table_counts_and_lists_the_breaches() -> None:
     text = report(rounds, Round(number=0, fault="the whole run"))
     assert "| stop | 2 | 1 | 1 failed stopped | 0.2, 0.3 | 0.3, 0.4 |" in text
     assert "- round 2, stop (answered): ack lost: stop 3" in text
+
+
+@pytest.mark.parametrize(
+    ("state", "step", "fault", "is_over"),
+    [
+        ("running", "park", "kill world", False),
+        ("running", REPORTING, "kill world", True),
+        ("running", REPORTING, "fill disk", False),
+        ("failed", REPORTING, "kill world", True),
+        ("succeeded", "", "fill disk", True),
+    ],
+)
+def test_a_mission_that_only_writes_its_report_need_not_be_ended_by_a_fault_that_ends_motions(
+    state: str, step: str, fault: str, is_over: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What cannot be recorded has not succeeded in any case."""
+    plant = Plant(command=lambda *_: [], runs=tmp_path)
+    monkeypatch.setattr(Plant, "state_of", lambda _self, _id: {"state": state, "step": step})
+    chaos = Chaos(plant, ChaosOptions(), arm="arm", devices=())
+    assert chaos._is_over("a task", next(one for one in FAULTS if one.name == fault)) is is_over
 
 
 def test_every_fault_has_a_name_of_its_own_and_can_be_chosen() -> None:

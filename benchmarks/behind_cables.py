@@ -2,6 +2,8 @@
 
 `python -m benchmarks.behind_cables [FIRST [COUNT]]`: each cell has two random cables drawn from its seed. Every object
 is viewed from close by, and those that cannot be read also from the sides. Results are judged by the simulator's truth.
+The last line counts the objects that cannot be read from straight ahead, and those of them that are right after at most two
+further looks.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +36,23 @@ from service.world_model import WorldModel
 BENCH = Path(__file__).resolve().parents[1] / "cells" / "bench.toml"
 FIRST, COUNT = 1000, 10
 ANSWERS = ("right", "wrong", "refused")
+MOST_LOOKS = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """The verdicts of a cell.
+
+    Attributes:
+        straight, after: from straight ahead, and after the looks from the sides.
+        soon: of the objects that were refused at first, how many were `right` within `MOST_LOOKS`, and the others.
+        told: a line for each wrong answer, and for each object that was refused at first.
+    """
+
+    straight: Counter[str]
+    after: Counter[str]
+    soon: Counter[str]
+    told: list[str]
 
 
 def with_cables(cell: Cell, *cables: CableSection) -> Cell:
@@ -93,55 +113,59 @@ def verdict(reading: ObjectReading, spec: PanelObject, truth: ObjectTruth) -> st
     return "right" if is_right else "wrong"
 
 
-def judge_cell(seed: int, folder: Path) -> tuple[Counter[str], Counter[str], list[str]]:
-    """Return the verdicts from straight ahead, those after the views from the sides, and a line per wrong answer."""
+def judge_cell(seed: int, folder: Path) -> Judged:
+    """Read a cell behind cables from straight ahead, then from the sides."""
     cell = load_cell(BENCH, seed=seed)
     random = np.random.default_rng(seed)
     half = (cell.panel.width_m / 2, cell.panel.height_m / 2)
     cell = with_cables(cell, drawn_cable(random, half), drawn_cable(random, half))
-    straight: Counter[str] = Counter()
-    after: Counter[str] = Counter()
-    wrong = []
+    judged = Judged(straight=Counter(), after=Counter(), soon=Counter(), told=[])
     with open_session(cell, folder) as session:
         first = close_ups(session, [panel_object.name for panel_object in cell.panel.objects])
         found = look_past(session, first)
         truth = {panel_object.name: panel_object for panel_object in session.connection.device("arm").truth().objects}
         for spec in cell.panel.objects:
             last = found.readings[spec.name]
-            straight[verdict(first.readings[spec.name], spec, truth[spec.name])] += 1
-            after[told := verdict(last, spec, truth[spec.name])] += 1
+            before = first.readings[spec.name]
+            judged.straight[ahead := verdict(before, spec, truth[spec.name])] += 1
+            judged.after[told := verdict(last, spec, truth[spec.name])] += 1
             if told == "wrong":
                 shown = truth[spec.name]
                 said = last.text or last.state or last.value
-                wrong.append(
-                    f"{seed}: {spec.name} is {shown.text or shown.state or shown.value}, read {said} at {last.confidence:.2f}"
+                judged.told.append(
+                    f"{spec.name} is {shown.text or shown.state or shown.value}, read {said} at {last.confidence:.2f}"
                 )
-    return straight, after, wrong
+            if ahead == "refused":
+                looks = [
+                    one.title
+                    for one in found.pictures[len(first.pictures) :]
+                    if spec.name in {r.name for r in one.readings}
+                ]
+                judged.soon["right" if told == "right" and len(looks) <= MOST_LOOKS else "others"] += 1
+                sides = ", ".join(title.rpartition(" from ")[2] for title in looks) or "no look"
+                judged.told.append(f"{spec.name}: {before.reason}; then {sides}: {told} ({last.reason})")
+    return judged
 
 
 def main(arguments: list[str]) -> int:
     """Entry point; returns the exit status."""
     first = int(arguments[0]) if arguments else FIRST
     count = int(arguments[1]) if len(arguments) > 1 else COUNT
-    straight: Counter[str] = Counter()
-    after: Counter[str] = Counter()
+    straight, after, soon = Counter[str](), Counter[str](), Counter[str]()
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(first, first + count):
             try:
-                ahead, aside, wrong = judge_cell(seed, Path(folder) / str(seed))
+                judged = judge_cell(seed, Path(folder) / str(seed))
             except CellError as error:  # a cable covers a border light, or the arm ran into one
                 print(f"{seed}: {error}")
                 continue
-            straight += ahead
-            after += aside
-            print(
-                f"{seed}: from ahead {ahead['right']} right, then {aside['right']} of {aside.total()}",
-                *wrong,
-                sep="\n  ",
-            )
+            straight, after, soon = straight + judged.straight, after + judged.after, soon + judged.soon
+            told = f"{judged.straight['right']} right, then {judged.after['right']} of {judged.after.total()}"
+            print(f"{seed}: from ahead {told}", *judged.told, sep="\n  ", flush=True)
     for name, counts in (("from straight ahead", straight), ("with looks from the sides", after)):
         print(f"{name:26s} " + ", ".join(f"{what} {counts[what] / max(counts.total(), 1):.3f}" for what in ANSWERS))
     print(f"{straight.total()} objects of {count} cells from seed {first}")
+    print(f"right within {MOST_LOOKS} further looks: {soon['right']} of {soon.total()}")
     return 0
 
 

@@ -27,10 +27,15 @@ SIDES = {  # rotations about the panel's x and y, in order around the object: th
     "above": (-1.0, 0.0),
 }
 SIDE_RAD = (0.42, 0.32)  # readers tolerate a tilt of 0.5; a cable 30 mm in front of a display appears shifted by 13 mm
+SIDE_M = (0.34, 0.38, CLOSE_UP_M)  # farther away than a close-up, because an occluder hangs in front of the panel
 NEAR_M = 0.25  # at such a tilt the fingers extend 10 cm beyond the camera
 NEAR_SIDES = {"close by below": (0.45, 0.0), "close by the right": (0.0, 0.2)}  # tilts, rad
 CLOSE_SIDES = (*NEAR_SIDES, "the right")  # for two states that look alike from farther away
+TINY_M = 1e-12  # of a direction, so that a line along a face divides by no zero
 REACH_M = 0.045  # half size of the area around an object that a close-up must show
+
+Box = tuple[RigidTransform, tuple[float, float, float]]
+"""Pose of its middle, and half of its edges, m."""
 
 
 def facing(
@@ -97,10 +102,9 @@ def side_poses(
 ) -> Iterator[RigidTransform]:
     """Yield camera poses that look at a panel point from one of the `SIDES`, past an occluder in front of it.
 
-    They are farther away than a close-up, because the occluder hangs in front of the panel, and at a tilt the fingers
-    come nearer to it. `turns`: the value in `SIDES`.
+    At a tilt the fingers come nearer to the occluder. `turns`: the value in `SIDES`.
     """
-    for distance_m in (0.34, 0.38, CLOSE_UP_M):
+    for distance_m in SIDE_M:
         for lean_rad in SIDE_RAD:
             for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
                 tilt = (lean_rad * turns[0], lean_rad * turns[1])
@@ -114,6 +118,37 @@ def poses_from(base_from_panel: RigidTransform, point_m: Sequence[float], side: 
         return
     for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
         yield facing(base_from_panel, point_m, NEAR_M, roll_rad=roll, tilt_rad=NEAR_SIDES[side])
+
+
+def sides_by_sight(points_m: Array, boxes: Sequence[Box]) -> list[str]:
+    """Return the `SIDES`, those from which boxes hide the least of some points first, and equal ones as listed.
+
+    Args:
+        points_m: (N, 3) in the panel frame, which is that of the boxes.
+    """
+
+    def hidden(side: str) -> float:
+        tilt_rad = (SIDE_RAD[0] * SIDES[side][0], SIDE_RAD[0] * SIDES[side][1])
+        view = facing(RigidTransform.identity(), points_m.mean(axis=0), SIDE_M[0], tilt_rad=tilt_rad)
+        return hidden_share(view.translation, points_m, boxes)
+
+    return sorted(SIDES, key=hidden)
+
+
+def hidden_share(eye_m: Array, points_m: Array, boxes: Sequence[Box]) -> float:
+    """Return the share of points (N, 3) whose lines of sight from a place (3,) cross a box; all in one frame.
+
+    A line crosses a box where it is between the planes of each pair of faces at once (Kay and Kajiya, 1986).
+    """
+    is_hidden = np.zeros(len(points_m), bool)
+    for parent_from_box, half_m in boxes:
+        box_from_parent = parent_from_box.inv()
+        eye, ways = box_from_parent.apply(eye_m), box_from_parent.apply(points_m) - box_from_parent.apply(eye_m)
+        ways = np.where(np.abs(ways) < TINY_M, TINY_M, ways)
+        planes = (np.array([[-1.0], [1.0]]) * np.asarray(half_m) - eye)[:, None] / ways
+        enters, leaves = planes.min(axis=0).max(axis=1), planes.max(axis=0).min(axis=1)
+        is_hidden |= (enters <= leaves) & (leaves > 0.0) & (enters < 1.0)
+    return float(is_hidden.mean())
 
 
 def close_up_groups(

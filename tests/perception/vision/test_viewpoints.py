@@ -20,10 +20,12 @@ from perception.vision.viewpoints import (
     SIDES,
     close_up_groups,
     facing,
+    hidden_share,
     overview_distance_m,
     overview_poses,
     reading_distance_m,
     side_poses,
+    sides_by_sight,
 )
 
 ROOT = Path(__file__).parents[3]
@@ -94,3 +96,37 @@ def test_close_ups_show_every_object_once_and_whole() -> None:
         for name in group:
             pixel = project(camera_from_panel.apply(np.array([PANEL.object(name).point_m])), LENS)[0]
             assert 20 < pixel[0] < LENS.width_px - 20 and 20 < pixel[1] < LENS.height_px - 20
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=60)
+def test_a_box_hides_the_points_whose_line_of_sight_passes_through_it(seed: int) -> None:
+    """Compared with points along each line, which are in the box or not."""
+    random = np.random.default_rng(seed)
+    box = transform_rpy(tuple(random.uniform(-0.1, 0.1, 3)), tuple(random.uniform(-3, 3, 3)))
+    half_m = (0.03, 0.05, 0.02)
+    eye, points = random.uniform(-0.3, 0.3, 3), random.uniform(-0.3, 0.3, (40, 3))
+    along = np.linspace(0.0, 1.0, 4001)[:, None, None]
+    inside = np.abs(box.inv().apply((eye + along * (points - eye)).reshape(-1, 3))) <= half_m
+    expected = inside.all(axis=1).reshape(len(along), -1).any(axis=0).mean()
+    assert hidden_share(eye, points, [(box, half_m)]) == pytest.approx(expected, abs=0.026)
+
+
+def test_a_thing_beside_the_line_of_sight_or_behind_the_eye_hides_nothing() -> None:
+    points = np.array([[0.0, 0.0, 0.0]])
+    beside, behind = (transform_rpy(place, (0.0, 0.0, 0.0)) for place in ((0.1, 0.0, 0.2), (0.0, 0.0, 0.5)))
+    thing = (0.01, 0.01, 0.01)
+    assert hidden_share(np.array([0.0, 0.0, 0.4]), points, [(beside, thing), (behind, thing)]) == 0.0
+    assert hidden_share(np.array([0.0, 0.0, 0.4]), points, []) == 0.0
+
+
+@pytest.mark.parametrize(("offset_m", "first"), [(-0.02, "the right"), (0.02, "the left")])
+def test_the_first_look_is_from_the_side_that_an_upright_cable_hides_least(offset_m: float, first: str) -> None:
+    """A cable left of the middle of a display hides none of it from the right, where it appears farther left."""
+    display = np.column_stack(
+        [*(a.ravel() for a in np.meshgrid(np.linspace(-0.03, 0.03, 9), [-0.01, 0.0, 0.01])), np.zeros(27)]
+    )
+    cable = (transform_rpy((offset_m, 0.0, 0.04), (0.0, 0.0, 0.0)), (0.004, 0.2, 0.004))
+    sides = sides_by_sight(display, [cable])
+    assert sides[0] == first and sorted(sides) == sorted(SIDES)
+    assert sides_by_sight(display, []) == list(SIDES)

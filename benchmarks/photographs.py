@@ -21,8 +21,9 @@ import numpy as np
 
 from benchmarks.display_drawing import PHOTOGRAPHS, draw_photograph
 from benchmarks.photograph_scenes import draw_scene, draw_without
+from benchmarks.printed_text import Print
 from benchmarks.vision_dials import DrawnDial, draw_dial
-from benchmarks.vision_manometers import USUAL, Print, Way, draw_manometer
+from benchmarks.vision_manometers import USUAL, Way, draw_manometer
 from hal.arrays import Image
 from hal.errors import CellError
 from perception.vision import decode, read_photograph

@@ -8,15 +8,12 @@ tested on seeds 70000 to 70320, 71000 to 71099 and 84000 to 84199.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib import get_data_path
 from numpy.typing import NDArray
-from PIL import Image as Pillow
-from PIL import ImageDraw, ImageFont
 
+from benchmarks.printed_text import Print, print_number, print_unit
 from benchmarks.vision_dials import CANVAS_PX, SPAN_RAD, Colour, DrawnDial, Pen, Rng, seen_aslant
 from hal.arrays import Image
 
@@ -29,19 +26,10 @@ WORDS = ("bar", "psi", "kPa", "kg/cm2", "MPa", "PRESSURE", "CL 1.6", "EN 837-1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Print:
-    """Numerals as large as on most gauges: a font of matplotlib, the height over the radius, whether tops point outwards."""
-
-    font: str
-    height: float
-    is_radial: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
     """Sweep of a pointer: its angle, the clockwise rotation of the whole gauge, whether the numerals run
     counter-clockwise, and whether a red pointer for the maximum, or for a set value, stands beside the black one.
-    Without a print the numerals are small.
+    Without a print the numerals are small. A `unit` is printed above or below the middle, as large as the numerals.
     """
 
     print: Print | None = None
@@ -49,6 +37,7 @@ class Way:
     turned_rad: float = 0.0
     falls: bool = False
     has_red: bool = False
+    unit: str = ""
 
     def angle_rad(self, share: float) -> float:
         """Return the angle of a fraction of the scale, clockwise from up."""
@@ -87,6 +76,8 @@ def on_canvas(rng: Rng, way: Way, at: float | None = None) -> tuple[Pen, DrawnDi
     level = int(rng.integers(215, 250))
     pen.disc(0.0, (0.0, 0.0), 1.0, (level, level, level - int(rng.integers(0, 15))))
     full = _face(pen, rng, way)
+    if way.print is not None and way.unit:
+        print_unit(pen, way.print, way.unit, INKS[0])
     red = _second_share(rng, share) if way.has_red else None
     if red is not None:
         _red_pointer(pen, rng, way.angle_rad(red))
@@ -176,7 +167,7 @@ def _ring(pen: Pen, rng: Rng, way: Way, full: float, steps: int, outer: float, i
         if k % minor:
             continue
         if way.print is not None:
-            _print(pen, way.print, f"{value:g}", turn, outer, ink)
+            print_number(pen, way.print, f"{value:g}", turn, outer, ink)
             continue
         at = (outer - 0.19) * np.array([np.cos(turn), np.sin(turn)])
         _write(pen, f"{value:g}", (float(at[0]), float(at[1])), size, ink)
@@ -188,25 +179,6 @@ def _usual_step(full: float, wanted: int) -> float:
     """Return the step of a usual scale whose number of steps is nearest to the wanted one, with all of its numbers told."""
     steps = [mantissa * 10.0**power for power in range(-2, 4) for mantissa in (1.0, 2.0, 2.5, 5.0)]
     return min((step for step in steps if 3.9 < full / step < 12.0), key=lambda step: abs(full / step - wanted))
-
-
-def _print(pen: Pen, how: Print, text: str, turn: float, outer: float, ink: Colour) -> None:
-    """Write a number inside of its tick."""
-    tall = how.height * pen.radius
-    font = ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / f"{how.font}.ttf"), tall / 0.72)
-    left, top, right, bottom = font.getbbox(text)
-    side = 2 * int(np.ceil(0.6 * np.hypot(right - left, bottom - top))) + 2
-    stamp = Pillow.new("L", (side, side))
-    ImageDraw.Draw(stamp).text(((side - left - right) / 2, (side - top - bottom) / 2), text, fill=255, font=font)
-    if how.is_radial:
-        stamp = stamp.rotate(-np.rad2deg(turn), Pillow.Resampling.BICUBIC)
-    half = 0.5 * np.array([bottom - top, right - left]) / pen.radius
-    reach = half[0] if how.is_radial else float(np.hypot(half[0] * np.cos(turn), half[1] * np.sin(turn)))
-    at = outer - 0.13 - reach
-    x, y = (place // 16 - side // 2 for place in pen.place(turn, (at, 0.0)))
-    share = np.asarray(stamp, float)[:, :, None] / 255
-    under = pen.canvas[y : y + side, x : x + side]
-    pen.canvas[y : y + side, x : x + side] = (under * (1 - share) + share * np.array(ink)).astype(np.uint8)
 
 
 def _arc(pen: Pen, way: Way, at: float, shares: tuple[float, float], colour: Colour, width: float) -> None:

@@ -1,14 +1,16 @@
-"""Teaches the reader of printed digits: `python -m benchmarks.vision_numerals [FILE]`.
+"""Teaches the readers of printed characters: `python -m benchmarks.vision_numerals digits|letters [FILE]`.
 
-Draws digits and letters of the fonts that matplotlib and OpenCV carry as a camera sees them, teaches a network of two
-layers on them, prints the shares that are right on drawings of fonts left out of a first teaching and of all fonts, and
-writes the network of all fonts. It takes minutes on one processor.
+Draws characters of the fonts that matplotlib and OpenCV carry as a camera sees them, teaches a network of two layers to
+tell the digits from each other and from anything else, or the letters of units, prints the shares that are right on
+drawings of fonts left out of a first teaching and of all fonts, and writes the network of all fonts. It takes minutes on
+one processor.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -20,7 +22,8 @@ from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
 from hal.arrays import Image
-from perception.vision.photographs.printed_digits import CELL, FILE, OTHER, Float32, Network, cell_of
+from perception.vision.photographs import printed_digits, units
+from perception.vision.photographs.printed_digits import CELL, Float32, Network, cell_of
 
 FONTS = (
     "DejaVuSans", "DejaVuSans-Bold", "DejaVuSans-Oblique", "DejaVuSansMono", "DejaVuSansMono-Bold", "DejaVuSerif",
@@ -29,14 +32,32 @@ FONTS = (
 )  # fmt: skip
 HERSHEY = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 LEFT_OUT = ("DejaVuSans-Bold", "cmss10", "STIXGeneral", cv2.FONT_HERSHEY_DUPLEX)
-LETTERS = "ABCDEFGHJKMNPQRSTUVWXYZabcdefghkmnprstuvwxyz%/()&"  # without those that look like 0 or 1
 DRAWN_PX = 96
-LETTER_SHARE, MARK_SHARE = 0.14, 0.08
+OTHER_SHARE, MARK_SHARE = 0.14, 0.08
 PICTURES, BATCH, ROUNDS, HIDDEN = 160_000, 256, 14, 160
 RATE, DECAY = 2e-3, 1e-5
 SEED = 24
 
 Font = str | int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alphabet:
+    """What a network tells apart: each class is drawn as any of its characters; `others` are no class, and look like none."""
+
+    file: Path
+    classes: tuple[str, ...]
+    others: str
+
+
+ALPHABETS = {
+    "digits": Alphabet(
+        file=printed_digits.FILE,
+        classes=tuple("0123456789"),
+        others="ABCDEFGHJKMNPQRSTUVWXYZabcdefghkmnprstuvwxyz%/()&",
+    ),
+    "letters": Alphabet(file=units.FILE, classes=units.GLYPHS, others="345678DEFGHJLNOQTUVWXYZdehjoqtuvwxyz%()&"),
+}
 
 
 @cache
@@ -108,15 +129,17 @@ def _cut(ink: Float32) -> Float32 | None:
     return None if h < 5 else np.asarray(ink[y : y + h, x : x + w], np.float32)
 
 
-def pictures(fonts: Sequence[Font], count: int, seed: int) -> tuple[Float32, NDArray[np.int64]]:
+def pictures(alphabet: Alphabet, fonts: Sequence[Font], count: int, seed: int) -> tuple[Float32, NDArray[np.int64]]:
     """Return (N, 20, 16) cells of random characters, and the class of each."""
+    other = len(alphabet.classes)
     random = np.random.default_rng(seed)
     cells, classes = list[Float32](), list[int]()
     while len(cells) < count:
         font = fonts[int(random.integers(len(fonts)))]
         share = random.random()
-        kind = OTHER if share < LETTER_SHARE + MARK_SHARE else int(random.integers(10))
-        character = LETTERS[int(random.integers(len(LETTERS)))] if kind == OTHER else str(kind)
+        kind = other if share < OTHER_SHARE + MARK_SHARE else int(random.integers(other))
+        characters = alphabet.others if kind == other else alphabet.classes[kind]
+        character = characters[int(random.integers(len(characters)))] if len(characters) > 1 else characters
         ink = seen(mark(random) if share < MARK_SHARE else drawn(font, character), random)
         if ink is not None:
             cells.append(cell_of(ink))
@@ -127,11 +150,12 @@ def pictures(fonts: Sequence[Font], count: int, seed: int) -> tuple[Float32, NDA
 def taught(cells: Float32, classes: NDArray[np.int64], progress: Callable[[str], None]) -> Network:
     """Return a network taught by Adam on the cross-entropy of the classes (Kingma and Ba, 2015)."""
     random = np.random.default_rng(SEED)
-    x, wanted = cells.reshape(len(cells), -1), np.eye(OTHER + 1, dtype=np.float32)[classes]
+    count = int(classes.max()) + 1
+    x, wanted = cells.reshape(len(cells), -1), np.eye(count, dtype=np.float32)[classes]
     inputs = CELL[0] * CELL[1]
     weights = [
         random.normal(0.0, np.sqrt(2.0 / inputs), (inputs, HIDDEN)).astype(np.float32), np.zeros(HIDDEN, np.float32),
-        random.normal(0.0, np.sqrt(2.0 / HIDDEN), (HIDDEN, OTHER + 1)).astype(np.float32), np.zeros(OTHER + 1, np.float32),
+        random.normal(0.0, np.sqrt(2.0 / HIDDEN), (HIDDEN, count)).astype(np.float32), np.zeros(count, np.float32),
     ]  # fmt: skip
     mean, square = [np.zeros_like(w) for w in weights], [np.zeros_like(w) for w in weights]
     steps, total = 0, ROUNDS * (len(x) // BATCH)
@@ -162,28 +186,33 @@ def _gradients(network: Network, x: Float32, wanted: Float32) -> tuple[list[Floa
 
 
 def right(network: Network, cells: Float32, classes: NDArray[np.int64]) -> str:
-    """Return the shares of digits, and of other characters, that are recognised."""
-    found = network.probabilities(cells).argmax(axis=1)
-    is_digit = classes != OTHER
+    """Return the shares of characters of the classes, and of others, that are recognised."""
+    found, other = network.probabilities(cells).argmax(axis=1), len(network.b) - 1
+    of_class = classes != other
     return (
-        f"digits {np.mean(found[is_digit] == classes[is_digit]):.4f}, "
-        f"others {np.mean(found[~is_digit] == OTHER):.4f}, of {len(cells)}"
+        f"of the classes {np.mean(found[of_class] == classes[of_class]):.4f}, "
+        f"others {np.mean(found[~of_class] == other):.4f}, of {len(cells)}"
     )
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Teach twice, print the shares, and write the network."""
-    file, every = Path(arguments[0]) if arguments else FILE, (*FONTS, *HERSHEY)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("alphabet", choices=ALPHABETS)
+    parser.add_argument("file", type=Path, nargs="?", default=None)
+    given = parser.parse_args(arguments)
+    alphabet, every = ALPHABETS[given.alphabet], (*FONTS, *HERSHEY)
+    file: Path = given.file or alphabet.file
     kept = [font for font in every if font not in LEFT_OUT]
     print(f"drawing {PICTURES} characters", flush=True)
-    first = taught(*pictures(kept, PICTURES // 2, SEED), print)
-    print("fonts left out:", right(first, *pictures(LEFT_OUT, 8000, SEED + 1)), flush=True)
-    last = taught(*pictures(every, PICTURES, SEED + 2), print)
-    print("all fonts:", right(last, *pictures(every, 8000, SEED + 3)))
+    first = taught(*pictures(alphabet, kept, PICTURES // 2, SEED), print)
+    print("fonts left out:", right(first, *pictures(alphabet, LEFT_OUT, 8000, SEED + 1)), flush=True)
+    last = taught(*pictures(alphabet, every, PICTURES, SEED + 2), print)
+    print("all fonts:", right(last, *pictures(alphabet, every, 8000, SEED + 3)))
     np.savez_compressed(file, **{name: getattr(last, name).astype(np.float16) for name in ("A", "a", "B", "b")})
     print(f"wrote {file.name}, {file.stat().st_size / 1e3:.0f} kB")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    raise SystemExit(main())

@@ -67,7 +67,9 @@ def read(
     pointer: Annotated[
         PointerColour | None, typer.Option(help="Which pointer is read if a red one stands beside another one.")
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the scale.")] = "",
+    unit: Annotated[
+        str, typer.Option(help="Unit of the scale; the only legible one on a gauge's face if not given.")
+    ] = "",
     scene: Annotated[bool, typer.Option("--scene", help="The picture is not cropped to the kind given.")] = False,
     least_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Readings with a lower confidence are refused.")

@@ -67,7 +67,7 @@ def read_pictures(
         kind=kind,
         answered=found.answered,
         value=found.value,
-        unit=unit,
+        unit=unit or found.unit,
         uncertainty=found.uncertainty,
         text=found.text,
         confidence=found.confidence,

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.devices import DeviceKind
-from hal.errors import NotFound, PerceptionError, Unreachable, Unsupported
+from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject, Toggle
-from manipulation import CollisionBox, visiting_order
+from manipulation import visiting_order
 from perception.vision import (
     CameraProjection,
     ObjectReading,
@@ -26,8 +26,8 @@ from perception.vision import (
 )
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, Scan, base_from, look, settle
-from service.operations.locate import go_to_overview, locate_from_overview, obstacles_in, offset_m
-from service.operations.range_detection import read_by_height, scan_beside
+from service.operations.locate import go_to_overview, locate_from_overview, offset_m
+from service.operations.range_detection import read_by_height, scan_beside, sides_by_sight
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
@@ -39,7 +39,6 @@ from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
 TURNED = "an earlier look showed the other state: look from the side, where the bat is not seen from its end"
-FOOTPRINT_POINTS = 9  # along each side of a footprint, of which a cable may hide some
 MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
@@ -219,7 +218,7 @@ def look_past(session: Session, found: Inspection) -> Inspection:
     for names, sides, distance_m in ways:
         objects = [session.panel.object(name) for name in names]
         for _, group in viewpoints.close_up_groups(objects, session.lens(), distance_m):
-            seen_past = sides or _sides_by_sight(session, group, found.scans)
+            seen_past = sides or sides_by_sight(session, group, found.scans)
             pictures += _from_the_sides(session, group, looks, seen_past)
     told = {name: _told(each) for name, each in looks.items()} | by_height
     for name in told:
@@ -227,33 +226,6 @@ def look_past(session: Session, found: Inspection) -> Inspection:
     readings = found.readings | told
     session.world.note_readings(readings.values())
     return replace(found, readings=readings, pictures=tuple(pictures))
-
-
-def _sides_by_sight(session: Session, group: Collection[str], scans: Iterable[Scan]) -> list[str]:
-    """Return the sides from which what stands before the panel hides the least of some objects first.
-
-    What stands there is taken from range images of near, where there are some, or else from the one of the whole panel.
-    """
-    panel_from_base = session.known_panel().parent_from_child.inv()
-    boxes = [one for image in scans for one in _seen_before_panel(session, image)] or (session.world.obstacles or ())
-    here = [(panel_from_base * one.parent_from_box, one.half_m) for one in boxes]
-    grids = [_footprint_m(session.panel.object(name)) for name in group]
-    return viewpoints.sides_by_sight(np.concatenate(grids), here)
-
-
-def _seen_before_panel(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
-    """Return the boxes around what a range image shows before the panel; none if it does not show the plate."""
-    try:
-        return obstacles_in(session, image)
-    except (PerceptionError, Unsupported):
-        return ()
-
-
-def _footprint_m(panel_object: PanelObject) -> Array:
-    """Return points (N, 3) of the panel frame all over the footprint of an object."""
-    half_x, half_y = panel_object.half_footprint_m
-    x, y = np.meshgrid(np.linspace(-half_x, half_x, FOOTPRINT_POINTS), np.linspace(-half_y, half_y, FOOTPRINT_POINTS))
-    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + panel_object.point_m
 
 
 def _from_the_sides(

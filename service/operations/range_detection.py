@@ -2,23 +2,26 @@
 
 This covers the kinds with a relief, such as mushroom buttons and handwheels. An object that is not found, or is found
 in another place, is scanned again from a shorter distance. The panel file is not corrected: an object that is still
-found in another place is reported and not operated. Caps whose states look alike are read by their heights.
+found in another place is reported and not operated. Caps whose states look alike are read by their heights, and objects
+behind a cable are looked at from the side that shows most of them.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from hal.arrays import Array
 from hal.devices import DeviceKind
-from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable
+from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable, Unsupported
 from hal.geometry import UncertainPose
 from hal.panel import Cap, Panel, PanelObject
+from manipulation import CollisionBox
 from perception.range import (
     PanelScan,
     RangeScene,
@@ -33,7 +36,7 @@ from perception.range import (
 )
 from perception.vision import ObjectReading, viewpoints
 from service.operations.acquisition import Scan, has_range_camera, scan, settle
-from service.operations.locate import ScannedPlane, ensure_space_is_known, plate_in, scan_plate
+from service.operations.locate import ScannedPlane, ensure_space_is_known, obstacles_in, plate_in, scan_plate
 from service.operations.session import Session
 from service.operations.travel import go_to_first
 from service.report.plots import png_of
@@ -42,6 +45,7 @@ from service.report.surfaces import Mark, surfaces_picture
 from service.schema.mission_results import SurfaceCheck
 
 OVERVIEW, FACING, CLOSER = "the overview", "before the panel", "a closer look"
+FOOTPRINT_POINTS = 9  # along each side of a footprint, of which a cable may hide some
 FOOTPRINT_RATIO = 1.4  # of an object with the plate around it to its footprint
 SURE_ODDS = 6.0  # least logarithm of the odds of a state that a height proves
 
@@ -334,6 +338,33 @@ def _reading(unread: ObjectReading, odds: float) -> ObjectReading:
     confidence = float(1.0 / (1.0 + np.exp(-abs(odds))))
     state = "released" if odds > 0 else "pressed"
     return replace(unread, state=state, confidence=confidence, reason=None, guess=None)
+
+
+def sides_by_sight(session: Session, group: Collection[str], scans: Iterable[Scan]) -> list[str]:
+    """Return the sides from which what stands before the panel hides the least of some objects first.
+
+    What stands there is taken from range images of near, where there are some, or else from the one of the whole panel.
+    """
+    panel_from_base = session.known_panel().parent_from_child.inv()
+    boxes = [one for image in scans for one in _seen_before_panel(session, image)] or (session.world.obstacles or ())
+    here = [(panel_from_base * one.parent_from_box, one.half_m) for one in boxes]
+    grids = [_footprint_m(session.panel.object(name)) for name in group]
+    return viewpoints.sides_by_sight(np.concatenate(grids), here)
+
+
+def _seen_before_panel(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
+    """Return the boxes around what a range image shows before the panel; none if it does not show the plate."""
+    try:
+        return obstacles_in(session, image)
+    except (PerceptionError, Unsupported):
+        return ()
+
+
+def _footprint_m(panel_object: PanelObject) -> Array:
+    """Return points (N, 3) of the panel frame all over the footprint of an object."""
+    half_x, half_y = panel_object.half_footprint_m
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, FOOTPRINT_POINTS), np.linspace(-half_y, half_y, FOOTPRINT_POINTS))
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + panel_object.point_m
 
 
 def surfaces_of_mission(session: Session, overview: ScannedPlane | None, *, is_touching: bool) -> SurfaceView | None:

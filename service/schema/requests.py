@@ -273,7 +273,13 @@ class ReadPhotographRequest(Strict):
             description="which pointer is read if a red one stands beside another one; black is the one that is not red"
         ),
     ] = None
-    unit: Annotated[str, Field(max_length=40, description="unit of the scale, repeated in the answer")] = ""
+    unit: Annotated[
+        str,
+        Field(
+            max_length=40,
+            description="unit of the scale, repeated in the answer; if empty, the only legible one on a gauge's face",
+        ),
+    ] = ""
     is_scene: Annotated[bool, Field(description="the picture is not cropped to an instrument whose kind is told")] = (
         False
     )

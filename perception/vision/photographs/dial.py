@@ -1,7 +1,7 @@
 """Reader of one dial that fills a photograph of a meter or gauge; nothing is taught, and at most its scale is told.
 
 The search for its pointers is in `hands`, that for the ends of its scale in `scale_ends`, and that for the scale itself, by its
-numerals, in `numerals` and `numeral_scale`.
+numerals, in `numerals` and `numeral_scale`. `units` reads the unit.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from perception.vision.photographs.numeral_direction import numerals_run
 from perception.vision.photographs.numeral_scale import SURE, PrintedScale, printed_scales
 from perception.vision.photographs.numerals import find_numbers
 from perception.vision.photographs.scale_ends import scale_ends
+from perception.vision.photographs.units import find_unit
 from perception.vision.reading import (
     ANSWER_AT,
     PatchReading,
@@ -91,7 +92,7 @@ def read_dial(
         scale = partial(_told_scale, as_gray(image), as_gray(picture), circle, (minimum, maximum))
     red_most = 1.0 if circular else RED_UNASKED
     found = _read(picture, circle, scale, pointer, red_most=red_most, least_confidence=least_confidence)
-    return replace(found, face=face)
+    return replace(found, face=face, unit=_unit_in(as_gray(image), circle, found))
 
 
 def read_by_numerals(
@@ -104,7 +105,13 @@ def read_by_numerals(
     picture, circle, face = _at_reading_size(image)
     scale = partial(_printed_scale, as_gray(image), circle)
     found = _read(picture, circle, scale, pointer, red_most=RED_UNASKED, least_confidence=least_confidence)
-    return replace(found, face=face)
+    return replace(found, face=face, unit=_unit_in(as_gray(image), circle, found))
+
+
+def _unit_in(gray: Image, circle: tuple[float, float, float], found: PatchReading) -> str:
+    """Return the unit that is printed on the dial of an answer, in a picture at its own size; `circle` as of `_printed_scale`."""
+    ratio = max(gray.shape) / SIDE_PX
+    return find_unit(gray, *(ratio * one for one in circle)) if found.answered else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

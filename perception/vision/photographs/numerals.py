@@ -65,7 +65,7 @@ def find_numbers(gray: Image, u: float, v: float, radius: float) -> list[list[Nu
         gray: (H, W) uint8.
         u, v, radius: the dial in it, px.
     """
-    face = _face(gray, u, v, radius)
+    face = face_around(gray, u, v, radius)
     return [
         _one_each(_numbers(characters(ink), place))
         for picture, place in ((face, _upright), (_unrolled(face), _radial))
@@ -90,7 +90,7 @@ def _same_place(one: Number, other: Number) -> bool:
     return bool(apart < 0.5 * max(len(one.text) * one.height, len(other.text) * other.height))
 
 
-def _face(gray: Image, u: float, v: float, radius: float) -> Image:
+def face_around(gray: Image, u: float, v: float, radius: float) -> Image:
     """Return the square around the dial, with the dial's radius `RADIUS_PX`."""
     scale, half = RADIUS_PX / radius, round(1.05 * RADIUS_PX)
     move = np.array([[scale, 0.0, half - scale * u], [0.0, scale, half - scale * v]])
@@ -111,7 +111,7 @@ def _unrolled(face: Image) -> Image:
 
 
 def _upright(x: Array, y: Array) -> tuple[Array, Array]:
-    """Return angle, and distance from the middle over the radius, of a place in `_face`."""
+    """Return angle, and distance from the middle over the radius, of a place in `face_around`."""
     across, up = x - 1.05 * RADIUS_PX, 1.05 * RADIUS_PX - y
     return np.arctan2(across, up), np.hypot(across, up) / RADIUS_PX
 

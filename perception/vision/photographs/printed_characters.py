@@ -47,10 +47,16 @@ def inks(face: Image) -> Iterator[Float32]:
     yield np.asarray(np.maximum(-over, 0.0), np.float32)
 
 
+def strong(ink: Float32) -> Iterator[NDArray[np.bool_]]:
+    """Yield where ink is stronger than a share of the strongest near it, for each of `INK_SHARES`."""
+    strongest = cv2.dilate(ink, np.ones((NEAR_PX, NEAR_PX), np.uint8))
+    for share in INK_SHARES:
+        yield np.asarray(ink > np.maximum(LEAST_LEVELS, share * strongest))
+
+
 def characters(ink: Float32) -> Characters:
     """Return the pieces of ink with the size of characters, points and signs; of those that overlap the likeliest digit."""
-    strongest = cv2.dilate(ink, np.ones((NEAR_PX, NEAR_PX), np.uint8))
-    pieces = [_pieces(ink, ink > np.maximum(LEAST_LEVELS, share * strongest)) for share in INK_SHARES]
+    pieces = [_pieces(ink, is_strong) for is_strong in strong(ink)]
     boxes, kinds = (np.concatenate([piece[k] for piece in pieces]) for k in (0, 1))
     digit = kinds[:, :OTHER].max(axis=1, initial=0.0)
     wide = np.sqrt(boxes[:, 2] / boxes[:, 3])  # each half of a 0 whose ends are faint resembles a 1

@@ -1,4 +1,4 @@
-"""Recognises single printed digits by a small network, which `benchmarks.vision_numerals` has taught on drawn characters."""
+"""Recognises single printed characters by a small network, which `benchmarks.vision_numerals` has taught on drawn ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ class Network:
             return Network(**{name: stored[name].astype(np.float32) for name in ("A", "a", "B", "b")})
 
     def probabilities(self, cells: Float32) -> Float32:
-        """Return (N, 11) probabilities that the cells (N, 20, 16), from `cell_of`, show 0 to 9, or no digit."""
+        """Return (N, classes) probabilities of what the cells (N, 20, 16), from `cell_of`, show.
+
+        Of digits the classes are 0 to 9, and whatever is no digit.
+        """
         hidden = np.maximum(cells.reshape(len(cells), -1) @ self.A + self.a, 0.0)
         level = hidden @ self.B + self.b
         raised = np.exp(level - level.max(axis=1, keepdims=True))
@@ -43,7 +46,7 @@ class Network:
 
 @cache
 def shipped_network() -> Network:
-    """Return the network that the package carries."""
+    """Return the network for digits that the package carries."""
     return Network.load()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -42,6 +43,14 @@ def test_both_ways_give_the_same_reading(web: httpx2.Client, photo: Path) -> Non
     assert printed.exit_code == 0 and json.loads(printed.output) == told
     spoken = run("read", photo, "--kind", "gauge", "--scale", "0..10", "--unit", "bar")
     assert f"{told['value']:.4g} bar" in spoken.output
+
+
+def test_the_unit_on_the_face_is_told_unless_the_caller_tells_one(tmp_path: Path) -> None:
+    photo = tmp_path / "unit.png"
+    drawn = draw_manometer(991000, replace(printed_way(991000), unit="bar"))
+    cv2.imwrite(str(photo), cv2.cvtColor(drawn.image, cv2.COLOR_RGB2BGR))
+    assert run("read", photo).output.split()[1] == "bar"
+    assert run("read", photo, "--unit", "atm").output.split()[1] == "atm"
 
 
 def test_of_two_pointers_the_asked_one_is_read_both_ways(web: httpx2.Client, tmp_path: Path) -> None:

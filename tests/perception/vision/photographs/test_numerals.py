@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.vision_manometers import Print, Way, draw_manometer
+from benchmarks.printed_text import Print
+from benchmarks.vision_manometers import Way, draw_manometer
 from hal.arrays import Image
 from perception.vision import read_photograph
 from perception.vision.photographs.numeral_scale import printed_scales

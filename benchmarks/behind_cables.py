@@ -25,7 +25,7 @@ from hal.simulated import ObjectTruth
 from perception.vision.reading import ObjectReading
 from service.evaluate import shown_of
 from service.operations.inspect import close_ups, look_past
-from service.operations.locate import go_to_overview, locate_from_overview
+from service.operations.locate import ensure_space_is_known, go_to_overview, locate_from_overview
 from service.operations.session import OperationContext, Session
 from service.processes.cell import CellRuntime
 from service.processes.connection import LocalConnection
@@ -121,6 +121,7 @@ def judge_cell(seed: int, folder: Path) -> Judged:
     cell = with_cables(cell, drawn_cable(random, half), drawn_cable(random, half))
     judged = Judged(straight=Counter(), after=Counter(), soon=Counter(), told=[])
     with open_session(cell, folder) as session:
+        ensure_space_is_known(session)  # as in every mission that touches the panel
         first = close_ups(session, [panel_object.name for panel_object in cell.panel.objects])
         found = look_past(session, first)
         truth = {panel_object.name: panel_object for panel_object in session.connection.device("arm").truth().objects}

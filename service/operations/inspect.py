@@ -27,7 +27,7 @@ from perception.vision import (
 from perception.vision import inspect as inspect_image
 from service.operations.acquisition import Look, Scan, base_from, look, settle
 from service.operations.locate import go_to_overview, locate_from_overview, offset_m
-from service.operations.range_detection import read_by_height, scan_beside, sides_by_sight
+from service.operations.range_detection import half_hidden, read_by_height, scan_beside, sides_by_sight
 from service.operations.session import Session, panel_object_or_all
 from service.operations.stored import object_result, read_stored
 from service.operations.travel import go_to_camera_view, skill_context
@@ -199,14 +199,18 @@ def look_close(
 def look_past(session: Session, found: Inspection) -> Inspection:
     """Look from the sides at objects that are present but could not be read, until they can be read.
 
-    The side from which the least of them is hidden comes first, where range images show what hides them. Of objects of
-    which two states look alike, a range image shows the height; those that it does not decide are looked at from a
-    shorter distance.
+    So are objects that were read though something hides much of them; the looks must agree then. The side from which the
+    least of them is hidden comes first, where range images show what hides them. Of objects of which two states look alike,
+    a range image shows the height; those that it does not decide are looked at from a shorter distance.
     """
     unread = [reading for reading in found.readings.values() if reading.present and not reading.answered]
     if len(unread) > MOST_UNREAD:
         return found
-    looks = {reading.name: [reading] for reading in unread}
+    read = [one.name for one in found.readings.values() if one.answered]
+    doubtful = half_hidden(session, read, found.scans) if found.scans else []
+    looks = {name: [found.readings[name]] for name in (*(one.name for one in unread), *doubtful)}
+    for name in doubtful:
+        session.world.forget_reading(name)  # it would decide the second look as well
     by_height = read_by_height(session, [one for one in unread if one.needs_closer_sides], found.scans)
     alike = [reading.name for reading in unread if reading.needs_closer_sides and reading.name not in by_height]
     hidden = [reading.name for reading in unread if not reading.needs_closer_sides]
@@ -214,6 +218,7 @@ def look_past(session: Session, found: Inspection) -> Inspection:
     ways = (
         (hidden, (), viewpoints.CLOSE_UP_M),
         (alike, viewpoints.CLOSE_SIDES, viewpoints.NEAR_M),
+        (doubtful, (), viewpoints.CLOSE_UP_M),
     )
     for names, sides, distance_m in ways:
         objects = [session.panel.object(name) for name in names]

@@ -21,7 +21,6 @@ from hal.devices import DeviceKind
 from hal.errors import DeviceError, NotFound, PerceptionError, Unreachable, Unsupported
 from hal.geometry import UncertainPose
 from hal.panel import Cap, Panel, PanelObject
-from manipulation import CollisionBox
 from perception.range import (
     PanelScan,
     RangeScene,
@@ -46,6 +45,7 @@ from service.schema.mission_results import SurfaceCheck
 
 OVERVIEW, FACING, CLOSER = "the overview", "before the panel", "a closer look"
 FOOTPRINT_POINTS = 9  # along each side of a footprint, of which a cable may hide some
+HIDDEN = 0.3  # share of a footprint behind something, from which a reading is looked at from a side as well
 FOOTPRINT_RATIO = 1.4  # of an object with the plate around it to its footprint
 SURE_ODDS = 6.0  # least logarithm of the odds of a state that a height proves
 
@@ -343,21 +343,32 @@ def _reading(unread: ObjectReading, odds: float) -> ObjectReading:
 def sides_by_sight(session: Session, group: Collection[str], scans: Iterable[Scan]) -> list[str]:
     """Return the sides from which what stands before the panel hides the least of some objects first.
 
-    What stands there is taken from range images of near, where there are some, or else from the one of the whole panel.
+    What stands there is taken from range images of near, and from the one of the whole panel, if it was taken.
     """
-    panel_from_base = session.known_panel().parent_from_child.inv()
-    boxes = [one for image in scans for one in _seen_before_panel(session, image)] or (session.world.obstacles or ())
-    here = [(panel_from_base * one.parent_from_box, one.half_m) for one in boxes]
+    boxes = _before_panel(session, scans)
     grids = [_footprint_m(session.panel.object(name)) for name in group]
-    return viewpoints.sides_by_sight(np.concatenate(grids), here)
+    return viewpoints.sides_by_sight(np.concatenate(grids), boxes)
 
 
-def _seen_before_panel(session: Session, image: Scan) -> tuple[CollisionBox, ...]:
-    """Return the boxes around what a range image shows before the panel; none if it does not show the plate."""
-    try:
-        return obstacles_in(session, image)
-    except (PerceptionError, Unsupported):
-        return ()
+def half_hidden(session: Session, names: Iterable[str], scans: Iterable[Scan]) -> list[str]:
+    """Return the objects of which something before the panel hides much from a camera straight before them."""
+    boxes = _before_panel(session, scans)
+    return [name for name in names if _hidden_share(session.panel.object(name), boxes) > HIDDEN]
+
+
+def _hidden_share(panel_object: PanelObject, boxes: Sequence[viewpoints.Box]) -> float:
+    eye_m = np.array([*panel_object.position_m, viewpoints.CLOSE_UP_M])
+    return viewpoints.hidden_share(eye_m, _footprint_m(panel_object), boxes)
+
+
+def _before_panel(session: Session, scans: Iterable[Scan]) -> list[viewpoints.Box]:
+    """Return the boxes around what range images show before the panel; none of one that does not show the plate."""
+    found = list(session.world.obstacles or ())
+    for image in scans:
+        with suppress(PerceptionError, Unsupported):
+            found += obstacles_in(session, image)
+    panel_from_base = session.known_panel().parent_from_child.inv()
+    return [(panel_from_base * one.parent_from_box, one.half_m) for one in found]
 
 
 def _footprint_m(panel_object: PanelObject) -> Array:

@@ -73,6 +73,24 @@ def test_a_toggle_that_an_earlier_look_showed_in_its_other_state_is_looked_at_fr
     assert len(inspect_close(session, ("pump",)).pictures) == 1, "the looks agree now"
 
 
+def test_what_is_read_behind_a_cable_is_looked_at_from_a_side_and_both_looks_must_agree(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    locate.ensure_space_is_known(session)
+    first = close_ups(session, ("temperature", "flow", "pump"))
+    assert range_detection.half_hidden(session, ("temperature", "flow", "pump"), first.scans) == ["temperature"]
+    monkeypatch.setattr(inspect, "half_hidden", lambda *_: ["pump"])
+    shown = replace(first, readings={"pump": first.readings["pump"]})
+    agreed = inspect.look_past(session, shown)
+    assert agreed.readings["pump"].state == truth_of(session, "pump").state
+    assert [picture.title for picture in agreed.pictures[len(first.pictures) :]] == ["pump from the right"]
+    other = {"on": "off", "off": "on"}[str(agreed.readings["pump"].state)]
+    deceived = replace(shown, readings={"pump": replace(shown.readings["pump"], state=other)})
+    found = inspect.look_past(session, deceived).readings["pump"]
+    assert not found.answered and "contradict each other" in str(found.reason)
+    assert "pump" not in session.world.readings or not session.world.readings["pump"].answered
+
+
 def test_a_side_that_the_arm_cannot_reach_is_left_out(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise Unreachable("no way there", hint="none")

@@ -22,6 +22,8 @@ CLEAR = 0.6  # confidence from which a second instrument makes the picture ambig
 # Least confidence and number of digits of a display whose kind was not told, because edges and words resemble digits.
 DISPLAY_CLEAR, LEAST_DIGITS = 0.8, 2
 DISPLAY_MOST = 0.75  # highest confidence of such a display
+GUESSED_MOST = 0.75  # highest confidence of a face whose pivot is guessed
+TURNED = 2  # of the faces found first, which are looked at with other places of their pivots if they cannot be read
 LEAST_FACE_PX = 24.0  # radius of a face that may be read
 NOTHING = (
     "no instrument is found in the picture: come closer, crop the picture to the instrument, or say which kind it is"
@@ -77,17 +79,34 @@ def _read_faces(image: Image, read: ReadFace, *, is_scene: bool) -> list[_Seen]:
     """Return the faces in a picture with their readings, without those that are too small, black or saturated."""
     filling = None if is_scene else _filling(image, read)
     found = [] if filling is None else [filling]
-    for face in find_faces(image):
+    for k, face in enumerate(find_faces(image)):
         if face.size_px < LEAST_FACE_PX:
             continue
-        view, image_from_view = face.view(image)
-        try:
-            reading = read(view)
-        except NotObservable:
+        seen = _seen(image, face, read)
+        if seen is None:
             continue
-        if reading.face is not None:
-            found.append(_Seen(face=face, reading=replace(reading, face=reading.face.moved(image_from_view))))
+        if not seen.reading.answered and k < TURNED:
+            others = [_seen(image, one, read) for one in face.otherwise(max(image.shape[:2]))]
+            guessed = [replace(one, reading=limited(one.reading, GUESSED_MOST)) for one in others if one is not None]
+            seen = max((seen, *guessed), key=_worth)
+        found.append(seen)
     return found
+
+
+def _seen(image: Image, face: Face, read: ReadFace) -> _Seen | None:
+    """Return a face as seen from straight ahead; None if nothing is found there, or the picture is black or saturated."""
+    view, image_from_view = face.view(image)
+    try:
+        reading = read(view)
+    except NotObservable:
+        return None
+    if reading.face is None:
+        return None
+    return _Seen(face=face, reading=replace(reading, face=reading.face.moved(image_from_view)))
+
+
+def _worth(seen: _Seen) -> tuple[bool, float]:
+    return seen.reading.answered, seen.reading.confidence
 
 
 def _filling(image: Image, read: ReadFace) -> _Seen | None:

@@ -43,6 +43,7 @@ CAP_RADII, CAP_WITHIN = (0.045, 0.2), 0.22  # shares of the face's radius: of th
 CAP_SIGMA_PX = 1.2
 LEAST_CAP = 0.75  # of the cap's outline that has an edge
 NEAREST = 0.7  # least focal length over the picture's longer side, which limits what perspective can do
+USUAL_FOCAL = 1.0  # focal length over the picture's longer side
 OFF_CAP = 0.04  # of the radius, by which the middle may be elsewhere for other reasons
 
 
@@ -73,6 +74,17 @@ class Face:
     def size_px(self) -> float:
         """Mean radius."""
         return float(np.sqrt(np.linalg.det(self.rim)))
+
+    def otherwise(self, side_px: int) -> Iterator[Face]:
+        """Yield it with other places of its pivot: in the middle, and where a usual camera shows it at this tilt.
+
+        The outline does not tell which end of the short axis is nearer to the camera. `side_px`: longer side of the picture.
+        """
+        (minor, major), axes = np.linalg.eigh(self.rim)
+        off = np.sqrt(max(0.0, 1.0 - (minor / major) ** 2)) * major / (USUAL_FOCAL * side_px)
+        for share in (0.0, 1.0, -1.0) if self.has_cap else (1.0, -1.0):
+            x, y = share * off * axes[:, 0]
+            yield replace(self, pivot=(float(x), float(y)), has_cap=False)
 
     def view(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Array]:
         """Return the face as seen from straight ahead, filling the picture, and `image_from_view` (3, 3) for pixels."""

@@ -13,7 +13,7 @@ from benchmarks.vision_dials import draw_dial
 from benchmarks.vision_manometers import draw_manometer
 from perception.vision import read_photograph
 from perception.vision.photographs.anywhere import NOTHING
-from perception.vision.photographs.faces import find_faces
+from perception.vision.photographs.faces import Face, find_faces
 from perception.vision.photographs.numeral_scale import PrintedScale
 
 SURE = 0.8
@@ -40,6 +40,27 @@ def test_the_view_of_a_face_shows_a_circle_from_straight_ahead() -> None:
     assert (image_from_view @ [middle, middle, 1.0])[:2] == pytest.approx(face.middle, abs=0.5)
     bright = np.argwhere(view[:, :, 0] > 160)
     assert np.ptp(bright[:, 0]) == pytest.approx(np.ptp(bright[:, 1]), abs=4.0)
+
+
+@pytest.mark.parametrize(("tilt_deg", "azimuth_deg"), [(20.0, 0.0), (35.0, 50.0), (48.0, 130.0), (40.0, 290.0)])
+def test_one_of_the_guessed_pivots_is_where_perspective_shows_the_middle(tilt_deg: float, azimuth_deg: float) -> None:
+    """A disc of 0.2 m at 0.5 m before a camera whose focal length is the side of its picture."""
+    side_px, radius_m, away_m = 800, 0.1, 0.5
+    axis = np.array([np.cos(np.deg2rad(azimuth_deg)), np.sin(np.deg2rad(azimuth_deg)), 0.0])
+    turns = np.linspace(0.0, 2 * np.pi, 400)
+    disc = radius_m * np.column_stack([np.cos(turns), np.sin(turns), np.zeros(400)])
+    points = disc @ cv2.Rodrigues(np.deg2rad(tilt_deg) * axis)[0].T + [0.0, 0.0, away_m]
+    outline = (side_px * points[:, :2] / points[:, 2:] + side_px / 2).astype(np.float32)
+    middle, axes, turn_deg = cv2.fitEllipse(outline)
+    c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+    turned = np.array([[c, -s], [s, c]])
+    face = Face(
+        middle=np.array(middle), rim=turned @ np.diag(np.array(axes) / 2) @ turned.T, coverage=1.0, has_cap=True
+    )
+    pivot = np.linalg.solve(face.rim, np.full(2, side_px / 2) - face.middle)
+    guesses = [one.pivot for one in face.otherwise(side_px)]
+    assert guesses[0] == (0.0, 0.0) and len(guesses) == 3
+    assert min(np.hypot(*np.subtract(guess, pivot)) for guess in guesses) < 0.03 < np.hypot(*pivot)
 
 
 def test_gauges_anywhere_are_read_with_their_kind_place_and_scale() -> None:

@@ -88,12 +88,16 @@ class SeenPointer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenScale:
-    """The scale by which a gauge was read: its end values, and the pointer's angles there, rad clockwise from up."""
+    """The scale by which a gauge was read: its end values, and the pointer's angles there, rad clockwise from up.
+
+    `by_numerals`: whether numerals on the face show it.
+    """
 
     minimum: float
     maximum: float
     at_min_rad: float
     at_max_rad: float
+    by_numerals: bool = False
 
     @property
     def is_full_turn(self) -> bool:

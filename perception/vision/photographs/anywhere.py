@@ -37,6 +37,12 @@ class _Seen:
     face: Face
     reading: PatchReading
 
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Whether it was read by numerals, and how surely: what else is round is no instrument beside one that has numerals."""
+        scale = self.reading.scale
+        return self.reading.answered and scale is not None and scale.by_numerals, self.reading.confidence
+
 
 def read_face_anywhere(image: Image, read: ReadFace, *, is_scene: bool) -> PatchReading:
     """Read the one round face in a picture by `read`, which reads a face that fills a picture.
@@ -86,9 +92,9 @@ def _read_faces(image: Image, read: ReadFace, *, is_scene: bool) -> list[_Seen]:
         if seen is None:
             continue
         if not seen.reading.answered and k < TURNED:
-            others = [_seen(image, one, read) for one in face.otherwise(max(image.shape[:2]))]
-            guessed = [replace(one, reading=limited(one.reading, GUESSED_MOST)) for one in others if one is not None]
-            seen = max((seen, *guessed), key=_worth)
+            guesses = [_seen(image, one, read) for one in face.otherwise(max(image.shape[:2]))]
+            proven = [_capped(one) for one in guesses if one is not None and one.rank[0]]
+            seen = max(proven, key=lambda one: one.rank, default=seen)
         found.append(seen)
     return found
 
@@ -105,8 +111,9 @@ def _seen(image: Image, face: Face, read: ReadFace) -> _Seen | None:
     return _Seen(face=face, reading=replace(reading, face=reading.face.moved(image_from_view)))
 
 
-def _worth(seen: _Seen) -> tuple[bool, float]:
-    return seen.reading.answered, seen.reading.confidence
+def _capped(guessed: _Seen) -> _Seen:
+    """Return what was seen with a guessed pivot, which is never sure."""
+    return replace(guessed, reading=limited(guessed.reading, GUESSED_MOST))
 
 
 def _filling(image: Image, read: ReadFace) -> _Seen | None:
@@ -121,11 +128,14 @@ def _filling(image: Image, read: ReadFace) -> _Seen | None:
 
 def _one_of(seen: Sequence[_Seen]) -> PatchReading | None:
     """Return the reading of the instrument in a picture; a refusal if there are several, None if there is none."""
-    read = sorted((one for one in seen if one.reading.answered), key=lambda one: -one.reading.confidence)
+    read = sorted((one for one in seen if one.reading.answered), key=lambda one: one.rank, reverse=True)
     if not read:
         return max((one.reading for one in seen), key=lambda one: one.confidence, default=None)
     best = read[0]
-    others = [one for one in read[1:] if one.reading.confidence >= CLEAR and not _overlap(one.face, best.face)]
+    others = [
+        one for one in read[1:]
+        if one.rank[0] == best.rank[0] and one.rank[1] >= CLEAR and not _overlap(one.face, best.face)
+    ]  # fmt: skip
     if others:
         return doubted(best.reading, _several([_told(one.reading) for one in (best, *others)]))
     return best.reading

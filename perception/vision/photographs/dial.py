@@ -123,21 +123,26 @@ class _ReadScale:
     seen: SeenScale
 
     @staticmethod
-    def on(scale: Scale, most: float) -> _ReadScale:
-        """Return what reads a pointer on a scale over a part of a turn."""
+    def on(scale: Scale, most: float, *, by_numerals: bool = False) -> _ReadScale:
+        """Return what reads a pointer on a scale over a part of a turn; `by_numerals` as of `SeenScale`."""
         return _ReadScale(
             status_of=partial(status_of_pointer, scale=scale, seen=1.0), most=most,
-            seen=SeenScale(minimum=scale.minimum, maximum=scale.maximum, at_min_rad=scale.at_min, at_max_rad=scale.at_max),
+            seen=SeenScale(
+                minimum=scale.minimum, maximum=scale.maximum, at_min_rad=scale.at_min, at_max_rad=scale.at_max,
+                by_numerals=by_numerals,
+            ),
         )  # fmt: skip
 
     @staticmethod
-    def on_full_turn(ends: tuple[float, float], most: float) -> _ReadScale:
+    def on_full_turn(ends: tuple[float, float], most: float, *, by_numerals: bool = False) -> _ReadScale:
         """Return what reads a pointer on a full turn from straight up with these values at its ends, clockwise."""
         first, last = ends
         at_min, at_max = (0.0, 2 * np.pi) if first < last else (2 * np.pi, 0.0)
         return _ReadScale(
             status_of=partial(_on_full_turn, minimum=first, maximum=last), most=most,
-            seen=SeenScale(minimum=min(ends), maximum=max(ends), at_min_rad=at_min, at_max_rad=at_max),
+            seen=SeenScale(
+                minimum=min(ends), maximum=max(ends), at_min_rad=at_min, at_max_rad=at_max, by_numerals=by_numerals
+            ),
         )  # fmt: skip
 
 
@@ -188,12 +193,13 @@ def _printed_scale(gray: Image, circle: tuple[float, float, float]) -> _ReadScal
         return NO_SCALE
     turn = scales[0].full_turn()
     if turn is not None:
-        return _ReadScale.on_full_turn((0.0, turn) if turn > 0.0 else (-turn, 0.0), scales[0].confidence)
+        ends = (0.0, turn) if turn > 0.0 else (-turn, 0.0)
+        return _ReadScale.on_full_turn(ends, scales[0].confidence, by_numerals=True)
     printed = scales[0].whole()
     scale = Scale(
         minimum=printed.minimum, maximum=printed.maximum, unit="", at_min=printed.at_min, at_max=printed.at_max
     )
-    return _ReadScale.on(scale, printed.confidence)
+    return _ReadScale.on(scale, printed.confidence, by_numerals=True)
 
 
 def _scales_in(gray: Image, circle: tuple[float, float, float]) -> list[PrintedScale]:
@@ -217,7 +223,7 @@ def _told_scale(
         if values[0] > values[1] and ends_rad[0] < ends_rad[1]:
             return _runs_clockwise(values)
         scale = Scale(minimum=low, maximum=high, unit="", at_min=ends_rad[0], at_max=ends_rad[1])
-        return _ReadScale.on(scale, SURE if printed.is_proven_if_told else BY_TICKS)
+        return _ReadScale.on(scale, SURE if printed.is_proven_if_told else BY_TICKS, by_numerals=True)
     return _scale_of(reduced, circle, values, None, circular=False)
 
 

@@ -83,6 +83,15 @@ def test_gauges_anywhere_are_read_with_their_kind_place_and_scale() -> None:
     assert right >= 3 and wrong <= 1
 
 
+@pytest.mark.parametrize("seed", [942028, 942032])
+def test_what_else_is_round_is_no_instrument_beside_one_with_numerals(seed: int) -> None:
+    """Told the scale, a flange with a bolt or a handwheel's spoke would be read, too."""
+    scene = draw_scene(seed, printed_way(seed))
+    told = read_photograph(scene.image, scale=(0.0, scene.full))
+    assert told.value == pytest.approx(scene.reading / 10 * scene.full, abs=0.025 * scene.full)
+    assert told.scale is not None and told.scale.by_numerals
+
+
 def test_where_no_instrument_is_none_is_read() -> None:
     for seed in range(720, 728):
         told = read_photograph(draw_without(seed))

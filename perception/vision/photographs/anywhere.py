@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,7 +23,8 @@ CLEAR = 0.6  # confidence from which a second instrument makes the picture ambig
 DISPLAY_CLEAR, LEAST_DIGITS = 0.8, 2
 DISPLAY_MOST = 0.75  # highest confidence of such a display
 GUESSED_MOST = 0.75  # highest confidence of a face whose pivot is guessed
-TURNED = 2  # of the faces found first, which are looked at with other places of their pivots if they cannot be read
+STEEP_MOST = 0.75  # highest confidence of a face that is seen steeply
+TURNED = 2  # of the faces found first, which are looked at with other places of their pivots
 LEAST_FACE_PX = 24.0  # radius of a face that may be read
 NOTHING = (
     "no instrument is found in the picture: come closer, crop the picture to the instrument, or say which kind it is"
@@ -82,21 +83,24 @@ def _display(gray: Image, ways: Sequence[bool]) -> PatchReading | None:
 
 
 def _read_faces(image: Image, read: ReadFace, *, is_scene: bool) -> list[_Seen]:
-    """Return the faces in a picture with their readings, without those that are too small, black or saturated."""
+    """Return the faces in a picture with their readings, without those that are too small, black or saturated.
+
+    If numerals show the scale of none of them, the first ones are looked at with other places of their pivots.
+    """
     filling = None if is_scene else _filling(image, read)
-    found = [] if filling is None else [filling]
-    for k, face in enumerate(find_faces(image)):
-        if face.size_px < LEAST_FACE_PX:
-            continue
-        seen = _seen(image, face, read)
-        if seen is None:
-            continue
-        if not seen.reading.answered and k < TURNED:
-            guesses = [_seen(image, one, read) for one in face.otherwise(max(image.shape[:2]))]
-            proven = [_capped(one) for one in guesses if one is not None and one.rank[0]]
-            seen = max(proven, key=lambda one: one.rank, default=seen)
-        found.append(seen)
-    return found
+    faces = [face for face in find_faces(image) if face.size_px >= LEAST_FACE_PX]
+    seen = [one for face in faces if (one := _seen(image, face, read)) is not None]
+    found = seen if filling is None else [filling, *seen]
+    return found if any(one.rank[0] for one in found) else [*found, *_guessed(image, faces[:TURNED], read)]
+
+
+def _guessed(image: Image, faces: Sequence[Face], read: ReadFace) -> Iterator[_Seen]:
+    """Yield the faces whose numerals show their scale if their pivots are elsewhere; what is read then is never sure."""
+    for face in faces:
+        for other in face.otherwise(max(image.shape[:2])):
+            seen = _seen(image, other, read)
+            if seen is not None and seen.rank[0]:
+                yield replace(seen, reading=limited(seen.reading, GUESSED_MOST))
 
 
 def _seen(image: Image, face: Face, read: ReadFace) -> _Seen | None:
@@ -108,12 +112,8 @@ def _seen(image: Image, face: Face, read: ReadFace) -> _Seen | None:
         return None
     if reading.face is None:
         return None
-    return _Seen(face=face, reading=replace(reading, face=reading.face.moved(image_from_view)))
-
-
-def _capped(guessed: _Seen) -> _Seen:
-    """Return what was seen with a guessed pivot, which is never sure."""
-    return replace(guessed, reading=limited(guessed.reading, GUESSED_MOST))
+    seen = replace(reading, face=reading.face.moved(image_from_view))
+    return _Seen(face=face, reading=limited(seen, STEEP_MOST) if face.is_steep else seen)
 
 
 def _filling(image: Image, read: ReadFace) -> _Seen | None:

@@ -43,6 +43,7 @@ CAP_RADII, CAP_WITHIN = (0.045, 0.2), 0.22  # shares of the face's radius: of th
 CAP_SIGMA_PX = 1.2
 LEAST_CAP = 0.75  # of the cap's outline that has an edge
 NEAREST = 0.7  # least focal length over the picture's longer side, which limits what perspective can do
+STEEP = 0.78  # ratio of the axes: of drawn gauges that were surely read at more than 40 degrees one of six was wrong
 USUAL_FOCAL = 1.0  # focal length over the picture's longer side
 OFF_CAP = 0.04  # of the radius, by which the middle may be elsewhere for other reasons
 
@@ -69,6 +70,12 @@ class Face:
     def is_clear(self) -> bool:
         """Whether it is surely round, or has a pivot, rather than by chance."""
         return self.has_cap or self.coverage >= CLEAR_COVERAGE
+
+    @property
+    def is_steep(self) -> bool:
+        """Whether it is seen so much aslant that a pivot a little beside its place shows in the reading."""
+        minor, major = np.linalg.eigvalsh(self.rim)
+        return bool(minor < STEEP * major)
 
     @property
     def size_px(self) -> float:

@@ -61,6 +61,7 @@ def test_one_of_the_guessed_pivots_is_where_perspective_shows_the_middle(tilt_de
     guesses = [one.pivot for one in face.otherwise(side_px)]
     assert guesses[0] == (0.0, 0.0) and len(guesses) == 3
     assert min(np.hypot(*np.subtract(guess, pivot)) for guess in guesses) < 0.03 < np.hypot(*pivot)
+    assert face.is_steep == (tilt_deg >= 40.0)
 
 
 def test_gauges_anywhere_are_read_with_their_kind_place_and_scale() -> None:
@@ -90,6 +91,13 @@ def test_what_else_is_round_is_no_instrument_beside_one_with_numerals(seed: int)
     told = read_photograph(scene.image, scale=(0.0, scene.full))
     assert told.value == pytest.approx(scene.reading / 10 * scene.full, abs=0.025 * scene.full)
     assert told.scale is not None and told.scale.by_numerals
+
+
+def test_what_is_seen_steeply_is_never_sure() -> None:
+    """Read at .93 and wrong by 4 % of the scale."""
+    scene = draw_scene(943004, printed_way(943004))
+    told = read_photograph(scene.image, scale=(0.0, scene.full))
+    assert told.confidence < SURE
 
 
 def test_where_no_instrument_is_none_is_read() -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hal.arrays import Image
 from hal.errors import NotObservable
 from perception.vision.image import as_gray
+from perception.vision.photographs.dial import MOVES
 from perception.vision.photographs.faces import Face, find_faces
 from perception.vision.photographs.photo_display import read_segments
 from perception.vision.reading import PatchReading, SeenFace, answer_at, doubted, limited, refused
@@ -85,13 +86,16 @@ def _display(gray: Image, ways: Sequence[bool]) -> PatchReading | None:
 def _read_faces(image: Image, read: ReadFace, *, is_scene: bool) -> list[_Seen]:
     """Return the faces in a picture with their readings, without those that are too small, black or saturated.
 
-    If numerals show the scale of none of them, the first ones are looked at with other places of their pivots.
+    If numerals show the scale of none of them, and no needle moves, the first ones are looked at with other places of their
+    pivots.
     """
     filling = None if is_scene else _filling(image, read)
     faces = [face for face in find_faces(image) if face.size_px >= LEAST_FACE_PX]
     seen = [one for face in faces if (one := _seen(image, face, read)) is not None]
     found = seen if filling is None else [filling, *seen]
-    return found if any(one.rank[0] for one in found) else [*found, *_guessed(image, faces[:TURNED], read)]
+    if any(one.rank[0] or one.reading.reason == MOVES for one in found):
+        return found
+    return [*found, *_guessed(image, faces[:TURNED], read)]
 
 
 def _guessed(image: Image, faces: Sequence[Face], read: ReadFace) -> Iterator[_Seen]:

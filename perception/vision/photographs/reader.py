@@ -12,7 +12,7 @@ from hal.arrays import Image
 from hal.errors import InvalidRequest
 from perception.vision.image import check_image
 from perception.vision.photographs.anywhere import read_anything, read_face_anywhere
-from perception.vision.photographs.dial import read_by_numerals, read_dial
+from perception.vision.photographs.dial import MOVES, read_by_numerals, read_dial
 from perception.vision.photographs.hands import Pointer
 from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.reading import ANSWER_AT, PatchReading
@@ -63,7 +63,7 @@ def read_photograph(
     if kind is None or is_scene:
         return read_face_anywhere(image, read, is_scene=is_scene)
     filling = read(image)
-    if filling.answered or filling.pointers:  # several pointers need a word of the caller
+    if filling.answered or filling.pointers or filling.reason == MOVES:  # several pointers need a word of the caller
         return filling
     found = read_face_anywhere(image, read, is_scene=True)
     return found if found.answered else filling

@@ -114,9 +114,21 @@ def drawn_force(robot: dict[str, Any]) -> DrawnForce | None:
 
 
 class BatchedScene(ui.scene):
-    """A drawing in 3-D whose changes within `together` reach the browser in one message instead of one each."""
+    """A drawing in 3-D whose changes within `together` reach the browser in one message instead of one each.
+
+    A browser that is still loading is sent nothing: when it is ready, NiceGUI sends it the whole drawing, and what had
+    been sent would be drawn twice.
+    """
 
     _calls: list[tuple[str, tuple[Any, ...]]] | None = None
+    _ready = False
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self.on("init", self._begin)
+
+    def _begin(self) -> None:
+        self._ready = True
 
     def run_method(self, name: str, *args: Any, timeout: float = 1.0) -> AwaitableResponse:
         """Call a method of the drawing in the browser."""
@@ -134,7 +146,7 @@ class BatchedScene(ui.scene):
             yield
         finally:
             self._calls = None
-        if calls:
+        if calls and self._ready:
             each = f"for (const [name, args] of {json.dumps(calls)}) runMethod({self.id}, name, args)"
             self.client.run_javascript(each)
 

@@ -28,6 +28,12 @@ SHOWN = (("", 1440, 900, "light"), ("-telephone", 390, 844, "dark"))
 OTHERS = (("-dark", 1440, 900, "dark"), ("-telephone-light", 390, 844, "light"))
 QUALITY = 70
 SETTLE_MS = 2500.0
+# A drawing in 3-D loads its parts one by one; the points come last. NiceGUI shows tests the scene as `scene_...`.
+POINTS_DRAWN = """Object.entries(window).filter(([name]) => name.startsWith('scene_')).some(([, scene]) => {
+    let found = false
+    scene.traverse(part => { found ||= Boolean(part.isPoints) })
+    return found
+})"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -111,6 +117,7 @@ def _pointed(page: Page, service: Served) -> None:
     service.end("/v1/missions", {"file": "inspect", "dry_run": True})
     until(page, "document.querySelector('.main').textContent.includes('The green way')")
     page.click('button:text-is("Show the scanner\'s points")')
+    until(page, POINTS_DRAWN)
 
 
 def _uploaded(page: Page, _service: Served) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from nicegui import json, ui
+from nicegui import ui
 from nicegui.awaitable_response import AwaitableResponse, NullResponse
 
 from hal.arrays import Array
@@ -114,41 +114,30 @@ def drawn_force(robot: dict[str, Any]) -> DrawnForce | None:
 
 
 class BatchedScene(ui.scene):
-    """A drawing in 3-D whose changes within `together` reach the browser in one message instead of one each.
+    """A drawing in 3-D whose changes within `together` reach the browser in one message instead of one each."""
 
-    A browser that is still loading is sent nothing: when it is ready, NiceGUI sends it the whole drawing, and what had
-    been sent would be drawn twice.
-    """
-
-    _calls: list[tuple[str, tuple[Any, ...]]] | None = None
-    _ready = False
-
-    def __init__(self, *args: Any, **named: Any) -> None:
-        super().__init__(*args, **named)
-        self.on("init", self._begin)
-
-    def _begin(self) -> None:
-        self._ready = True
+    _calls: list[list[Any]] | None = None
 
     def run_method(self, name: str, *args: Any, timeout: float = 1.0) -> AwaitableResponse:
         """Call a method of the drawing in the browser."""
         if self._calls is None:
             return super().run_method(name, *args, timeout=timeout)
-        self._calls.append((name, args))
+        self._calls.append([name, *args])
         return NullResponse()
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Collect the calls of this block, and send them at its end."""
-        calls: list[tuple[str, tuple[Any, ...]]] = []
-        self._calls = calls
+        """Collect the calls of this block, and send them at its end.
+
+        To a browser that is still loading NiceGUI sends nothing: it sends the whole drawing when the browser is ready.
+        """
+        calls = self._calls = []
         try:
             yield
         finally:
             self._calls = None
-        if calls and self._ready:
-            each = f"for (const [name, args] of {json.dumps(calls)}) runMethod({self.id}, name, args)"
-            self.client.run_javascript(each)
+        if calls:
+            self.run_method("run_methods", calls)
 
 
 class CellScene:

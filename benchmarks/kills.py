@@ -96,11 +96,20 @@ def killed(role: str, times: int, *, seed: int, cell: Path) -> list[Round]:
 
 def chaos_rounds(faults: tuple[str, ...], times: int, *, seed: int, cell: Path, folder: Path) -> list[Round]:
     """Run chaos with some faults only; returns the rounds, and as the last one what the end of the run shows."""
+    plant = Plant(command=serve_command(cell, None), runs=folder / "runs")
+    chaos = chaos_on(plant, cell, ChaosOptions(seed=seed, rounds=times, faults=faults))
+    return all_rounds(chaos)
+
+
+def chaos_on(plant: Plant, cell: Path, options: ChaosOptions) -> Chaos:
+    """Return a run of chaos with the devices of a cell file."""
     kinds = {name: section.kind.value for name, section in load_cell(cell).file.devices.items()}
     arm = next(name for name, kind in kinds.items() if kind == "arm")
-    options = ChaosOptions(seed=seed, rounds=times, faults=faults)
-    plant = Plant(command=serve_command(cell, None), runs=folder / "runs")
-    chaos = Chaos(plant, options, arm=arm, devices=tuple(kinds))
+    return Chaos(plant, options, arm=arm, devices=tuple(kinds))
+
+
+def all_rounds(chaos: Chaos) -> list[Round]:
+    """Run all rounds and print each; returns them, and as the last one what the end of the run shows."""
     rounds = list(chaos.rounds(lambda one: print(f"  {one}", file=sys.stderr, flush=True)))
     return [*rounds, chaos.final]
 

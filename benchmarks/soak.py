@@ -1,8 +1,10 @@
-"""Memory and descriptors of a service under a mix for long: `python -m benchmarks.soak [--minutes 30] [--settle 5]`.
+"""Memory and descriptors of a service for long: `python -m benchmarks.soak [--minutes 30] [--settle 5] [--chaos SEED]`.
 
-Missions, readings, pictures, listeners of the stream that come and go, stops with resets, and broken requests. The memory that
-each process has for itself (unique set size) and its open descriptors are sampled. After the first minutes, in which libraries
-and kernels load, the memory may grow by 5 MB and the descriptors not at all. Prints a table and the pass line.
+Under a mix: missions, readings, pictures, listeners of the stream that come and go, stops with resets, and broken requests. Or
+under chaos, which breaks something in each mission; `--same-service` leaves out the two faults that end the service, because a
+service that lives for minutes only shows no slow growth. The memory that each process has for itself (unique set size) and its
+open descriptors are sampled. After the first minutes, in which libraries and kernels load, the memory may grow by 5 MB and the
+descriptors not at all. Prints a table, the breaches of the chaos and the pass line.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +25,23 @@ import psutil
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
+from benchmarks.kills import all_rounds, chaos_on
 from hal.errors import CellError
+from service.chaos.family import roles_of
+from service.chaos.faults import FAULTS
+from service.chaos.options import ChaosOptions
 from service.chaos.plant import Plant, serve_command
 from service.client import FINAL, ApiError
 
-ROOT = Path(__file__).resolve().parents[1]
+CELL = Path(__file__).resolve().parents[1] / "cells/bench.toml"
 START_S = 400.0
 EVERY_S = 5.0
 STOP_EVERY_S = 180.0  # so that missions also come to their ends and write their reports
 PASS_MB = 5.0
 WINDOW = 0.2  # of the samples: the medians of the first and the last ones are compared
 ROLES = ("service", "cell", "stop", "world")
+Samples = dict[str, list[tuple[float, float]]]
+"""Memory in MB and descriptors of each role, one pair a sample."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,23 +49,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--settle", type=float, default=5.0, help="minutes that do not count")
+    parser.add_argument("--chaos", type=int, help="break things with this seed instead of the mix")
+    parser.add_argument("--same-service", action="store_true", help="no chaos that ends the service")
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        plant = Plant(command=serve_command(ROOT / "cells/bench.toml", None), runs=Path(folder) / "runs")
-        end = threading.Event()
-        try:
-            plant.start()
-            plant.await_ready(START_S)
-            done = [0] * len(MIX)
-            for number in range(len(MIX)):
-                threading.Thread(target=_repeat, args=(number, plant, end, done), daemon=True).start()
-            samples = _sampled(plant, 60.0 * given.minutes, 60.0 * given.settle)
-            tracebacks = sum("Traceback" in line for line in plant.lines)
-        finally:
-            end.set()
-            plant.end()
-            plant.sweep()
-    print(", ".join(f"{count} x {work.__name__[1:]}" for work, count in zip(MIX, done, strict=True)))
+        plant = Plant(command=serve_command(CELL, None), runs=Path(folder) / "runs")
+        work = _mixed if given.chaos is None else partial(_broken, given.chaos, given.same_service)
+        samples, breaches = work(plant, given.minutes, given.settle)
+        tracebacks = sum("Traceback" in line for line in plant.lines)
     print(
         "| process | MB at first | at last | grown | descriptors at first | at last |\n| --- | --- | --- | --- | --- | --- |"
     )
@@ -69,18 +70,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     print(
         f"memory {grown_mb:+.1f} MB after {given.settle:.0f} of {given.minutes:.0f} minutes (pass: +{PASS_MB:.0f}), descriptors "
-        f"{more:+.0f} (pass: 0), tracebacks {tracebacks} (pass: 0), load {os.getloadavg()[0]:.0f}"
+        f"{more:+.0f} (pass: 0), tracebacks {tracebacks} (pass: 0), breaches {breaches} (pass: 0), load {os.getloadavg()[0]:.0f}"
     )
-    return int(grown_mb > PASS_MB or more > 0 or tracebacks > 0)
+    return int(grown_mb > PASS_MB or more > 0 or tracebacks + breaches > 0)
 
 
-def _sampled(plant: Plant, seconds: float, settle_s: float) -> dict[str, list[tuple[float, float]]]:
+def _mixed(plant: Plant, minutes: float, settle: float) -> tuple[Samples, int]:
+    """Return the samples under the mix, in which nothing is judged."""
+    end = threading.Event()
+    done = [0] * len(MIX)
+    try:
+        plant.start()
+        plant.await_ready(START_S)
+        for number in range(len(MIX)):
+            threading.Thread(target=_repeat, args=(number, plant, end, done), daemon=True).start()
+        samples = _sampled(plant, end, minutes=minutes, settle=settle)
+    finally:
+        end.set()
+        plant.end()
+        plant.sweep()
+    print(", ".join(f"{count} x {work.__name__[1:]}" for work, count in zip(MIX, done, strict=True)))
+    return samples, 0
+
+
+def _broken(seed: int, same_service: bool, plant: Plant, minutes: float, settle: float) -> tuple[Samples, int]:
+    """Return the samples under chaos, and the number of its breaches."""
+    faults = tuple(fault.name for fault in FAULTS if not (same_service and fault.restarts))
+    chaos = chaos_on(plant, CELL, ChaosOptions(seed=seed, minutes=minutes, faults=faults))
+    end = threading.Event()
+    with ThreadPoolExecutor(1) as watcher:
+        found = watcher.submit(_sampled, plant, end, minutes=minutes, settle=settle)
+        try:
+            *rounds, final = all_rounds(chaos)
+        finally:
+            end.set()
+    breaches = [f"{one.fault}: {breach}" for one in (*rounds, final) for breach in one.breaches]
+    print("\n".join([f"{len(rounds)} rounds in {plant.life} lives of the service", *breaches]))
+    return found.result(), len(breaches)
+
+
+def _sampled(plant: Plant, end: threading.Event, *, minutes: float, settle: float) -> Samples:
     """Return memory in MB and descriptors of each role, sampled after the time to settle."""
     begun_s = time.monotonic()
-    rows: dict[str, list[tuple[float, float]]] = {role: [] for role in ROLES}
-    while (passed_s := time.monotonic() - begun_s) < seconds:
-        time.sleep(EVERY_S)
-        for role, process in plant.roles().items() if passed_s >= settle_s else ():
+    rows: Samples = {role: [] for role in ROLES}
+    while (passed_s := time.monotonic() - begun_s) < 60.0 * minutes and not end.wait(EVERY_S):
+        for role, process in roles_of(plant.pid).items() if passed_s >= 60.0 * settle else ():
             with suppress(psutil.Error):
                 one = psutil.Process(process.pid)
                 rows[role].append((one.memory_full_info().uss / 1e6, float(one.num_fds())))

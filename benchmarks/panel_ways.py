@@ -38,7 +38,7 @@ from perception.vision import (
 )
 from service.knowledge.store import KnowledgeStore
 from simbackend.camera import CameraOptions
-from simbackend.camera_sensor import CameraSensor, SensorOptions
+from simbackend.camera_sensor import NOMINAL_EXPOSURE_S, CameraSensor, SensorOptions
 from simbackend.draws import Draws
 from simbackend.panel_world import PanelWorld
 from simbackend.wire import PictureInfo
@@ -96,7 +96,7 @@ def views(cell: Cell) -> Iterator[View]:
     sensor = CameraSensor(
         Draws(seed).lens("wrist_camera", lens),
         SensorOptions(
-            exposure_s=o.exposure_s, oversample=o.oversample, blur_px=o.blur_px, vignette=o.vignette,
+            oversample=o.oversample, blur_px=o.blur_px, vignette=o.vignette,
             full_well_electrons=o.full_well_electrons, read_noise_electrons=o.read_noise_electrons, is_colour=False,
         ),
     )  # fmt: skip
@@ -133,7 +133,7 @@ def _exposed(
         tick=0, stamp_s=0.0, camera_from_base=base_from_camera.inv(), base_from_panel=world.base_from_panel,
         lit=world.emitters(),
     )  # fmt: skip
-    return sensor.expose(info, image[:, :, 0], rng)
+    return sensor.expose(info, image[:, :, 0], NOMINAL_EXPOSURE_S, rng)
 
 
 def by_lights(view: View) -> UncertainPose:

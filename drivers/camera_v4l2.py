@@ -11,7 +11,7 @@ import cv2
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.kinds.cameras import LensOptions, nominal, to_pixels
+from drivers.kinds.cameras import ExposureSetter, LensOptions, nominal, to_pixels
 from drivers.transport.device import PortDevice
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 from drivers.transport.mailbox import IMAGES_RING
@@ -28,6 +28,7 @@ from hal.wires import ResourceClaim, WireOptions
 
 GRAB_FAILURES = 3
 OLDEST_S = 2.0  # a stamp farther away is of another clock
+IN_WORK = 3  # frames that the camera, the kernel and OpenCV may hold with the exposure before
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
 
 
@@ -75,6 +76,10 @@ class Grabber(Protocol):
         """Return the stamp that the kernel gave to the last frame, on the links' clock; None if there is none."""
         ...
 
+    def set_exposure(self, exposure_s: float) -> float | None:
+        """Set the exposure of the frames to come; return the one that the camera has taken, or None if it does not tell."""
+        ...
+
     def read(self) -> tuple[bool, NDArray[Any]]:
         """Wait for the next frame; return whether it was read, and its pixels."""
         ...
@@ -115,17 +120,23 @@ class Capture:
             pixel_format=code.decode("ascii", "replace"),
             exposure_s=None if options.exposure_s is None else self._known(cv2.CAP_PROP_EXPOSURE, EXPOSURE_UNIT_S),
             gain_db=self._known(cv2.CAP_PROP_GAIN, 1.0),
+            exposure_range_s=None if options.exposure_s is None else (EXPOSURE_UNIT_S, 1.0 / self.rate_hz),
         )
 
     def _write(self, options: CameraV4l2Options) -> None:
         if options.exposure_s is not None:
             self._video.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1)  # manual
-            self._video.set(cv2.CAP_PROP_EXPOSURE, options.exposure_s / EXPOSURE_UNIT_S)
+            self.set_exposure(options.exposure_s)
         if options.gain is not None:
             self._video.set(cv2.CAP_PROP_GAIN, options.gain)
         if options.white_balance_k is not None:
             self._video.set(cv2.CAP_PROP_AUTO_WB, 0)
             self._video.set(cv2.CAP_PROP_WB_TEMPERATURE, options.white_balance_k)
+
+    def set_exposure(self, exposure_s: float) -> float | None:
+        """Set the exposure of the frames to come; return the one that the camera has taken, or None if it does not tell."""
+        self._video.set(cv2.CAP_PROP_EXPOSURE, exposure_s / EXPOSURE_UNIT_S)
+        return self._known(cv2.CAP_PROP_EXPOSURE, EXPOSURE_UNIT_S)
 
     def _known(self, name: int, unit: float) -> float | None:
         value = float(self._video.get(name))
@@ -160,6 +171,8 @@ class CameraV4l2(PortDevice[Image]):
         self._failures = 0
         self._rate_hz = options.rate_hz
         self._settings = UNKNOWN
+        self._setter = ExposureSetter()
+        self._in_work = 0  # frames to come that were exposed as before
         self._pauses = Pauses(longest_s=1.0 / options.rate_hz)
         opener = open_grabber or (lambda: Capture(options, context.name))
         self.port: Port[Grabber] = Port(context.name, open_link=opener, tenant=self)
@@ -184,6 +197,10 @@ class CameraV4l2(PortDevice[Image]):
         """
         return self.newest(deadline, not_before_s=self.context.clock.now_s())
 
+    def set_exposure(self, exposure_s: float, *, deadline: Deadline) -> None:
+        """Set the exposure of the frames that are read after this call."""
+        self._setter.set(self, self._settings, exposure_s, deadline)
+
     def set_up(self, link: Grabber) -> None:
         """Take over what the camera has accepted (owner thread)."""
         self._failures = 0
@@ -198,6 +215,10 @@ class CameraV4l2(PortDevice[Image]):
 
     def serve(self, link: Grabber) -> None:
         """Grab and publish one frame."""
+        if (wanted_s := self._setter.wanted_s()) is not None:
+            self._settings = replace(self._settings, exposure_s=link.set_exposure(wanted_s) or wanted_s)
+            self._in_work = IN_WORK
+            self._setter.confirm()
         is_good, frame = link.read()
         arrived_s = now_s()
         if not is_good:
@@ -208,6 +229,9 @@ class CameraV4l2(PortDevice[Image]):
             return
         self._failures = 0
         self._check_size((frame.shape[1], frame.shape[0]))
+        if self._in_work > 0:
+            self._in_work -= 1
+            return
         captured_s = link.captured_s()
         if self._pauses.may_be_held_up(arrived_s, 1) and captured_s is None:
             self.errors += 1  # without the kernel's stamp nothing shows how old it is

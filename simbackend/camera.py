@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from hal.calibration import CameraIntrinsics
+from hal.camera_settings import CameraSettings
 from hal.clock import Deadline
 from hal.devices import CameraCapabilities, DeviceKind, Image
 from hal.readings import Cause, Quality, Stamped
@@ -18,6 +19,7 @@ from simbackend.device import VALID, SimDevice, SimOptions, parse
 
 NEAR_M = 0.02
 RATE_HZ = 20.0
+EXPOSURE_RANGE_S = (1e-4, 0.2)
 FOCAL_RATIO = 460.0 / 640.0  # lens of the data sheet: 70 degrees across
 
 
@@ -52,7 +54,6 @@ class SimCamera(SimDevice[Image]):
         record = world.cell.calibration_of(context.name).intrinsics
         recorded = self._nominal if record is None else scaled(record.intrinsics(), options.width_px, options.height_px)
         sensor_options = SensorOptions(
-            exposure_s=options.exposure_s,
             oversample=options.oversample,
             blur_px=options.blur_px,
             vignette=options.vignette,
@@ -70,21 +71,30 @@ class SimCamera(SimDevice[Image]):
             centre=self._sensor.centre,
             near_m=NEAR_M,
         )
+        self._exposure_s = options.exposure_s
         self._newest: tuple[int, float, Image] | None = None
 
     def capabilities(self) -> CameraCapabilities:
-        """Return size, colour and nominal lens."""
+        """Return size, colour, nominal lens and exposure."""
         return CameraCapabilities(
             width_px=self._options.width_px,
             height_px=self._options.height_px,
             is_colour=self._options.colour,
             rate_hz=RATE_HZ,
             nominal=self._nominal,
+            settings=CameraSettings(exposure_s=self._exposure_s, exposure_range_s=EXPOSURE_RANGE_S),
         )
 
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
         """Return the image of the present tick; rendering it does not advance time."""
         return self._sample(deadline)
+
+    def set_exposure(self, exposure_s: float, *, deadline: Deadline) -> None:
+        """Set the exposure of the images that are read from now on."""
+        self._check(deadline)
+        self.capabilities().settings.check_exposure(exposure_s, self._name)
+        self._exposure_s = exposure_s
+        self._newest = None
 
     def _measure(self, frame: Frame, bias: float) -> tuple[Image, Quality, Cause]:
         newest = self._newest
@@ -95,10 +105,10 @@ class SimCamera(SimDevice[Image]):
     def _draw(self, bias: float) -> Image:
         info, radiance = self._world.radiance(self._view, is_colour=self._options.colour)
         random = self._world.draws.at_tick(self._name, info.tick)
-        pixels = self._sensor.expose(info, radiance, random)
+        pixels = self._sensor.expose(info, radiance, self._exposure_s, random)
         if bias:
             pixels = np.clip(pixels.astype(float) + bias, 0, 255).astype(np.uint8)  # an offset in grey levels
-        return Image(pixels=pixels, exposure_s=self._options.exposure_s)
+        return Image(pixels=pixels, exposure_s=self._exposure_s)
 
 
 def nominal_lens(width_px: int, height_px: int) -> CameraIntrinsics:

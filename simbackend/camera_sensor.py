@@ -33,7 +33,6 @@ GLOW_STEP_PX = 4  # the glow is smooth: computed on every fourth pixel
 class SensorOptions:
     """Degradations of an image; radiance 1 at 10 ms is full scale."""
 
-    exposure_s: float
     oversample: float
     blur_px: float
     vignette: float
@@ -66,7 +65,7 @@ class CameraSensor:
         self._table = np.empty(0, np.float32)
         self._vignette = _vignette(lens, options.vignette)
 
-    def expose(self, info: PictureInfo, radiance: Grey, random: np.random.Generator) -> Pixels:
+    def expose(self, info: PictureInfo, radiance: Grey, exposure_s: float, random: np.random.Generator) -> Pixels:
         """Return the image, (H, W) or (H, W, 3) uint8, from an ideal rendering of size `drawn`."""
         reduced = cv2.resize(radiance, self._reduced, interpolation=cv2.INTER_AREA)
         places, fractions = self._maps
@@ -74,7 +73,7 @@ class CameraSensor:
         seen = self._glow(info, np.asarray(bent, np.float32))
         if self._options.blur_px > 0.0:
             seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), self._options.blur_px), np.float32)
-        gain = np.float32(self._options.exposure_s / NOMINAL_EXPOSURE_S)
+        gain = np.float32(exposure_s / NOMINAL_EXPOSURE_S)
         vignette = self._vignette if seen.ndim == 2 else self._vignette[:, :, None]
         return self._digitise(seen * (vignette * gain), random)
 

@@ -83,6 +83,11 @@ class ScriptedGrabber:
         """Return when the last frame was captured."""
         return self._captured_s
 
+    def set_exposure(self, exposure_s: float) -> float | None:
+        """Take no exposure: this camera tells none."""
+        del exposure_s
+        return None
+
     def read(self) -> tuple[bool, NDArray[Any]]:
         """Wait for the next frame."""
         camera, nothing = self._camera, np.empty((0, 0), np.uint8)

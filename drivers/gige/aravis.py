@@ -61,6 +61,8 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_software_trigger": (None, (c_void_p, _Failure)),
     "arv_camera_set_frame_rate": (None, (c_void_p, c_double, _Failure)),
     "arv_camera_get_exposure_time": (c_double, (c_void_p, _Failure)),
+    "arv_camera_get_exposure_time_bounds": (None, (c_void_p, POINTER(c_double), POINTER(c_double), _Failure)),
+    "arv_camera_get_exposure_time_auto": (c_int, (c_void_p, _Failure)),
     "arv_camera_set_exposure_time": (None, (c_void_p, c_double, _Failure)),
     "arv_camera_set_exposure_time_auto": (None, (c_void_p, c_int, _Failure)),
     "arv_camera_is_exposure_time_available": (c_bool, (c_void_p, _Failure)),
@@ -200,6 +202,12 @@ class AravisCamera:
         self.do("get_region", *(byref(n) for n in numbers))
         x, y, width, height = (n.value for n in numbers)
         return x, y, width, height
+
+    def exposure_bounds_us(self) -> tuple[float, float]:
+        """Return the least and the longest exposure in microseconds."""
+        least, longest = c_double(), c_double()
+        self.do("get_exposure_time_bounds", byref(least), byref(longest))
+        return least.value, longest.value
 
     def disable_packet_socket(self) -> None:
         """Receive through an ordinary socket; a packet socket sees one network interface only and needs privileges."""

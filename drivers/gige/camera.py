@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from drivers.gige.frames import Frame
 from drivers.gige.settings import GigeCameraOptions
 from drivers.gige.source import FrameSource, GenicamSource, address_of
-from drivers.kinds.cameras import nominal
+from drivers.kinds.cameras import ExposureSetter, nominal
 from drivers.kinds.pixel_formats import FORMATS, decode
 from drivers.transport.device import SLICE_S, PortDevice
 from drivers.transport.link import NoAnswer, WireError, now_s
@@ -30,6 +31,7 @@ SILENCE_S = 0.3
 SHORT_IDS = 1 << 16  # GigE Vision 1 counts frames from 1 to 65535 and then from 1 again
 REORDERED = 16  # frames
 LATE_S = 1e-3  # accuracy of stamps
+IN_WORK = 2  # frames that a camera may have begun, or prepared, with the exposure before
 ASK_EVERY_S = 1.0  # how often an exposure that the camera chooses is read, and a waiting camera is checked
 INCOMPLETE = (
     "frame {frame} is unusable: {fault}; raise `net.core.rmem_max` and `packet_bytes`, or set a `packet_delay_ns`"
@@ -54,6 +56,7 @@ class GigeCamera(PortDevice[Image]):
         self._time = HostTime()
         self._settings = CameraSettings()
         self._exposure_s: float | None = None
+        self._setter = ExposureSetter()
         self._size = (options.width_px or 1, options.height_px or 1)
         self._is_colour = options.is_colour
         self._begin_session()
@@ -79,6 +82,10 @@ class GigeCamera(PortDevice[Image]):
         self._asked.set()
         return self.newest(deadline, not_before_s=asked_s)
 
+    def set_exposure(self, exposure_s: float, *, deadline: Deadline) -> None:
+        """Set the exposure of the frames that are read after this call."""
+        self._setter.set(self, self._settings, exposure_s, deadline)
+
     def set_up(self, link: FrameSource) -> None:
         """Take over what the camera has been set to (owner thread)."""
         self._settings = link.settings
@@ -98,9 +105,12 @@ class GigeCamera(PortDevice[Image]):
         self._is_exposing = not self._is_triggered
         self._waiting_since_s = self._triggered_s = now_s()
         self._asked_camera_s = now_s()
+        self._in_work = 0  # frames to come that were exposed as before
 
     def serve(self, link: FrameSource) -> None:
         """Wait for one frame and publish it (owner thread)."""
+        if (wanted_s := self._setter.wanted_s()) is not None:
+            self._take_exposure(link, wanted_s)
         if not self._is_exposing and not self._expose(link):
             return
         frame = link.pop(SLICE_S)
@@ -108,6 +118,13 @@ class GigeCamera(PortDevice[Image]):
             self._take(link, frame)
         elif now_s() - self._waiting_since_s > self._silence_s + (self._exposure_s or 0.0):
             self._miss(link)
+
+    def _take_exposure(self, link: FrameSource, exposure_s: float) -> None:
+        link.set_exposure(exposure_s)
+        self._exposure_s = link.exposure_s()
+        self._settings = replace(self._settings, exposure_s=self._exposure_s)
+        self._in_work = 0 if self._is_triggered else IN_WORK
+        self._setter.confirm()
 
     def _expose(self, link: FrameSource) -> bool:
         """Start an exposure if one is asked for; return whether it was."""
@@ -136,6 +153,10 @@ class GigeCamera(PortDevice[Image]):
             self.errors += 1  # repeated or late, so a newer one has been given
             return
         self._lost += skipped
+        if self._in_work > 0:
+            self._in_work -= 1
+            self._waiting_since_s = now_s()
+            return
         if frame.fault is not None:
             self._refuse(frame)
             return

@@ -109,6 +109,7 @@ def read_back(camera: AravisCamera, options: GigeCameraOptions) -> CameraSetting
         pixel_format=camera.do("get_pixel_format_as_string"),
         trigger=options.trigger,
         exposure_s=exposure_of(camera),
+        exposure_range_s=_exposure_range_s(camera),
         gain_db=camera.do("get_gain") if camera.do("is_gain_available") else None,
         white_balance=_read_white_balance(camera) if options.white_balance != "auto" else None,
         stamped_by="device",
@@ -120,6 +121,16 @@ def exposure_of(camera: AravisCamera) -> float | None:
     if not camera.do("is_exposure_time_available"):
         return None
     return float(camera.do("get_exposure_time")) / US
+
+
+def _exposure_range_s(camera: AravisCamera) -> tuple[float, float] | None:
+    """Return the exposures that can be set; None if the camera chooses, or has no such setting."""
+    if not camera.do("is_exposure_time_available"):
+        return None
+    if camera.do("is_exposure_auto_available") and camera.do("get_exposure_time_auto") != OFF:
+        return None
+    least_us, longest_us = camera.exposure_bounds_us()
+    return least_us / US, longest_us / US
 
 
 def _write_region(camera: AravisCamera, options: GigeCameraOptions) -> None:

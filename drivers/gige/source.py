@@ -10,7 +10,7 @@ from typing import Protocol
 
 from drivers.gige.aravis import AravisCamera, AravisError, cameras_found
 from drivers.gige.frames import Frame
-from drivers.gige.settings import GigeCameraOptions, exposure_of, read_back, write
+from drivers.gige.settings import US, GigeCameraOptions, exposure_of, read_back, write
 from drivers.kinds.cameras import release_in_background
 from drivers.transport.link import LinkLost, NoAnswer, now_s
 from hal.camera_settings import CameraSettings
@@ -41,6 +41,10 @@ class FrameSource(Protocol):
 
     def exposure_s(self) -> float | None:
         """Ask the camera for its present exposure time."""
+        ...
+
+    def set_exposure(self, exposure_s: float) -> None:
+        """Set the exposure time of the frames that begin after this call."""
         ...
 
     def check(self) -> None:
@@ -110,6 +114,10 @@ class GenicamSource:
         except AravisError as error:
             raise NoAnswer(str(error)) from error
 
+    def set_exposure(self, exposure_s: float) -> None:
+        """Set the exposure time of the frames that begin after this call."""
+        self._ask("set_exposure_time", exposure_s * US)
+
     def check(self) -> None:
         """Check that the camera still answers and obeys this program."""
         if not self._camera.is_controller():
@@ -126,9 +134,9 @@ class GenicamSource:
             self._camera.stop()
         self._camera.release()
 
-    def _ask(self, command: str) -> None:
+    def _ask(self, command: str, *values: float) -> None:
         try:
-            self._camera.do(command)
+            self._camera.do(command, *values)
         except AravisError as error:
             raise NoAnswer(str(error)) from error
 

@@ -1,4 +1,4 @@
-"""Code shared by cameras: a nominal lens, and conversion of OpenCV pictures to the pixels of an `Image`."""
+"""Code shared by cameras: a nominal lens, pixels of an `Image` from OpenCV's pictures, and an exposure that is set later."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from drivers.transport.device import WireDevice, wall_until
+from drivers.transport.link import now_s
 from hal.calibration import CameraIntrinsics
+from hal.camera_settings import CameraSettings
+from hal.clock import Deadline
 from hal.strict import Strict
 
 Pixels = NDArray[np.uint8]
@@ -51,6 +55,36 @@ def to_pixels(bgr: NDArray[Any], *, is_colour: bool) -> Pixels:
         bgr = cv2.cvtColor(bgr, cv2.COLOR_GRAY2BGR)
     code = cv2.COLOR_BGR2RGB if is_colour else cv2.COLOR_BGR2GRAY
     return np.ascontiguousarray(cv2.cvtColor(bgr, code), dtype=np.uint8)
+
+
+class ExposureSetter:
+    """Passes an exposure from a caller to the owner thread of a camera, and returns when the camera has taken it."""
+
+    def __init__(self) -> None:
+        self._one_caller = threading.Lock()
+        self._taken = threading.Event()
+        self._wanted_s: float | None = None
+
+    def set(self, device: WireDevice[Any], settings: CameraSettings, exposure_s: float, deadline: Deadline) -> None:
+        """Have the owner thread set an exposure, and wait for it; errors as of `AdjustableExposure.set_exposure`."""
+        device.require_open()
+        settings.check_exposure(exposure_s, device.name)
+        began_s = now_s()
+        with self._one_caller:
+            self._taken.clear()
+            self._wanted_s = exposure_s
+            if not self._taken.wait(wall_until(deadline) - began_s):
+                self._wanted_s = None
+                raise device.timeout(now_s() - began_s)
+
+    def wanted_s(self) -> float | None:
+        """Return the exposure that is asked for, which counts as seen; None if there is none (owner thread)."""
+        wanted_s, self._wanted_s = self._wanted_s, None
+        return wanted_s
+
+    def confirm(self) -> None:
+        """Let the caller go on, because the next frame has the exposure (owner thread)."""
+        self._taken.set()
 
 
 def release_in_background(work: Callable[[], object], wait_s: float) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 import numpy as np
 from pydantic import Field
 
-from drivers.kinds.cameras import to_pixels
+from drivers.kinds.cameras import ExposureSetter, to_pixels
 from drivers.realsense.stream import RealsenseFrame, RealsenseOptions, RealsenseStream, StreamFacts
 from drivers.transport.device import SLICE_S, PortDevice
 from drivers.transport.link import LinkLost, NoAnswer, RecordingEnded, now_s
@@ -27,6 +27,7 @@ T = TypeVar("T")
 SILENCE_S = 1.0
 CONNECT_S = 6.0
 DEFAULT_RATE_HZ = 30.0
+IN_WORK = 3  # frames that the camera and the library may hold with the exposure before
 
 
 class DepthOptions(RealsenseOptions):
@@ -66,6 +67,10 @@ class FrameStream(Protocol):
         """Return the next frame, or None when none comes in time."""
         ...
 
+    def set_exposure(self, exposure_s: float) -> None:
+        """Set the exposure of the frames to come."""
+        ...
+
     def check(self) -> None:
         """Raise `LinkLost` if the camera is gone."""
         ...
@@ -91,6 +96,8 @@ class RealsenseDevice(PortDevice[T]):
         self._last_number: int | None = None
         self._heard_s = now_s()
         self._has_ended = False
+        self.setter = ExposureSetter()
+        self._in_work = 0  # frames to come that were exposed as before
         self._open_stream = open_stream or (lambda: RealsenseStream(options, context.name))
         self.port: Port[FrameStream] = Port(context.name, open_link=self._open, tenant=self)
 
@@ -117,6 +124,10 @@ class RealsenseDevice(PortDevice[T]):
 
     def serve(self, link: FrameStream) -> None:
         """Wait for one frame and publish it (owner thread)."""
+        if (wanted_s := self.setter.wanted_s()) is not None:
+            link.set_exposure(wanted_s)
+            self._facts, self._in_work = link.facts, IN_WORK
+            self.setter.confirm()
         frame = link.wait(SLICE_S)
         if frame is None:
             self._bear_silence(link)
@@ -125,6 +136,9 @@ class RealsenseDevice(PortDevice[T]):
         missed = self._missed(frame.number)
         if missed is None:
             self.errors += 1
+            return
+        if self._in_work > 0:
+            self._in_work -= 1
             return
         left_s = self._time.host_s(device_s=frame.device_s, arrived_s=frame.arrived_s)
         settings = self.facts().settings
@@ -258,6 +272,10 @@ class RealsenseColour(RealsenseDevice[Image]):
     def read_image(self, *, deadline: Deadline) -> Stamped[Image]:
         """Return an image whose exposure began after this call."""
         return self.newest(deadline, not_before_s=self.context.clock.now_s())
+
+    def set_exposure(self, exposure_s: float, *, deadline: Deadline) -> None:
+        """Set the exposure of the images that are read after this call."""
+        self.setter.set(self, self.facts().settings, exposure_s, deadline)
 
     def give(self, frame: RealsenseFrame, valid_s: float, missed: int) -> None:
         """Publish the image."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.kinds.cameras import release_in_background
-from drivers.transport.link import LinkLost, now_s
+from drivers.transport.link import LinkLost, NoAnswer, now_s
 from hal.calibration import CameraIntrinsics
 from hal.camera_settings import CameraSettings
 from hal.errors import ConfigError, DeviceUnavailable
@@ -152,6 +152,17 @@ class RealsenseStream:
             unit_m=float(frame.get_units()) if self._name == "depth" else 0.0,
         )
 
+    def set_exposure(self, exposure_s: float) -> None:
+        """Set the exposure of the frames to come, and read back what the camera has taken."""
+        sensor, exposure = self._sensor(), self._rs.option.exposure
+        unit_s = self._exposure_unit_s(sensor)
+        try:
+            sensor.set_option(exposure, exposure_s / unit_s)
+            taken_s = sensor.get_option(exposure) * unit_s
+        except RuntimeError as error:
+            raise NoAnswer(f"the camera does not take an exposure of {exposure_s:g} s: {error}") from error
+        self.facts = replace(self.facts, settings=replace(self.facts.settings, exposure_s=taken_s))
+
     def check(self) -> None:
         """Check that the camera is still connected.
 
@@ -245,6 +256,13 @@ class RealsenseStream:
     def _exposure_unit_s(self, sensor: Any) -> float:
         return 1e-4 if sensor.get_option_range(self._rs.option.exposure).max <= COARSE_EXPOSURE_TO else 1e-6
 
+    def _exposure_range_s(self, options: RealsenseOptions, sensor: Any) -> tuple[float, float] | None:
+        """Return the exposures that can be set; None if the camera may choose, or is a recording."""
+        if not isinstance(options.exposure_s, float) or options.recording is not None:
+            return None
+        unit_s, limits = self._exposure_unit_s(sensor), sensor.get_option_range(self._rs.option.exposure)
+        return limits.min * unit_s, limits.max * unit_s
+
     def _read_back(self, options: RealsenseOptions) -> StreamFacts:
         profile = self._profile.get_stream(getattr(self._rs.stream, self._name)).as_video_stream_profile()
         lens, sensor, rs = profile.get_intrinsics(), self._sensor(), self._rs
@@ -259,6 +277,7 @@ class RealsenseStream:
             gain_db=sensor.get_option(rs.option.gain) if sensor.supports(rs.option.gain) else None,
             latency_s=1.0 / rate_hz if options.latency_s is None else options.latency_s,
             stamped_by="device",
+            exposure_range_s=self._exposure_range_s(options, sensor),
         )
         is_brown = str(lens.model).rsplit(".", maxsplit=1)[-1] in BROWN
         k1, k2, p1, p2, k3 = lens.coeffs if is_brown else (0.0,) * 5

@@ -8,10 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hal.camera_settings import AdjustableExposure
 from hal.conformance.device import DeviceContract, level
 from hal.conformance.rig import Level, Rig
 from hal.devices import Camera, DeviceKind, ForceTorque, Proximity, RangeScanner, SweptScanner, Touch
+from hal.errors import InvalidRequest
 from hal.readings import Quality, Stamped
+
+EXPOSURE_STEP = 0.1  # cameras count in steps: V4L2 in 100 us
 
 
 class CameraContract(DeviceContract[Camera]):
@@ -35,6 +39,25 @@ class CameraContract(DeviceContract[Camera]):
         c = rig.device.capabilities()
         assert (c.nominal.width_px, c.nominal.height_px) == (c.width_px, c.height_px)
         assert c.nominal.fx_px > 0 and c.nominal.fy_px > 0
+
+    @level(Level.READ)
+    def test_an_exposure_that_is_set_is_that_of_the_next_frame(self, rig: Rig[Camera]) -> None:
+        range_s = rig.device.capabilities().settings.exposure_range_s
+        if range_s is None:
+            pytest.skip("the exposure of this camera cannot be set")
+        assert isinstance(rig.device, AdjustableExposure)
+        before_s = self.read(rig).value.exposure_s
+        try:
+            for factor in (0.5, 0.8):
+                wanted_s = min(max(range_s[0], factor * before_s), range_s[1])
+                rig.device.set_exposure(wanted_s, deadline=rig.deadline())
+                assert self.read(rig).value.exposure_s == pytest.approx(wanted_s, rel=EXPOSURE_STEP)
+            for wrong_s in (0.5 * range_s[0], 2.0 * range_s[1]):
+                with pytest.raises(InvalidRequest):
+                    rig.device.set_exposure(wrong_s, deadline=rig.deadline())
+        finally:
+            rig.device.set_exposure(before_s, deadline=rig.deadline())
+        assert self.read(rig).value.exposure_s == pytest.approx(before_s, rel=EXPOSURE_STEP)
 
 
 class RangeScannerContract(DeviceContract[RangeScanner]):

@@ -5,7 +5,8 @@ A line scanner is swept by the wrist, and its lines become the depth image that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,6 +35,10 @@ SETTLE_S = 0.06  # time in which lamps and arm come to rest
 SWEPT_RAD = 0.96  # angle that the lines of a sweep are spread over
 LEAST_LINES, MOST_LINES = 96, 160  # of a swept image; the lines may be closer to each other than the beams of a line
 LONGEST_PASS_S = 20.0  # of the two passes of a sweep
+# What cannot be read is looked at with another exposure if its bright parts, the gray level that 5 % of it exceed, are far
+# from BRIGHT, or if more than GLARED of it is saturated, which does not say by how much.
+BRIGHT, BRIGHT_QUANTILE, SATURATED, GLARED, GLARE_FACTOR = 180.0, 95.0, 250, 0.05, 0.3
+LEAST_CHANGE, MOST_CHANGE = 1.5, 8.0  # of an exposure, as a factor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -174,6 +179,50 @@ def look_with_lights(session: Session) -> LightPair:
     return LightPair(off=off, on=on)
 
 
+def better_exposure_s(session: Session, seen: Look, boxes_px: Sequence[Array]) -> float | None:
+    """Return an exposure at which what is in some boxes is neither dark nor saturated.
+
+    Args:
+        boxes_px: points (N, 2) around each of the objects that cannot be read; without any, the whole image counts.
+
+    Returns:
+        The exposure in seconds; None if the present one is right, or the camera's cannot be set.
+    """
+    settings = session.connection.device(seen.camera).capabilities().settings
+    if settings.exposure_range_s is None or settings.exposure_s is None:
+        return None
+    least_s, longest_s = settings.exposure_range_s
+    better_s = min(max(settings.exposure_s * _light_factor(seen.pixels, boxes_px), least_s), longest_s)
+    change = better_s / settings.exposure_s
+    return better_s if max(change, 1.0 / change) > LEAST_CHANGE else None
+
+
+def _light_factor(pixels: NDArray[np.uint8], boxes_px: Sequence[Array]) -> float:
+    """Return by what the light on some boxes of an image should be multiplied."""
+    height, width = pixels.shape[:2]
+    is_meant = np.zeros((height, width), bool)
+    for points in boxes_px:
+        (left, top), (right, bottom) = np.floor(np.min(points, axis=0)), np.ceil(np.max(points, axis=0))
+        is_meant[max(0, int(top)) : max(0, int(bottom)), max(0, int(left)) : max(0, int(right))] = True
+    meant = pixels[is_meant if is_meant.any() else ~is_meant]
+    if np.mean(meant >= SATURATED) > GLARED:
+        return GLARE_FACTOR
+    bright = max(float(np.percentile(meant, BRIGHT_QUANTILE)), 1.0)
+    return min(max(BRIGHT / bright, 1.0 / MOST_CHANGE), MOST_CHANGE)
+
+
+@contextmanager
+def exposed(session: Session, camera: str, exposure_s: float) -> Iterator[None]:
+    """Set the exposure of a camera, which must be an `AdjustableExposure`, within a block."""
+    device = session.connection.device(camera)
+    before_s = device.capabilities().settings.exposure_s
+    device.set_exposure(exposure_s, deadline=deadline())
+    try:
+        yield
+    finally:
+        device.set_exposure(before_s, deadline=deadline())
+
+
 def scan(session: Session) -> Scan:
     """Return one range image from the present pose of the arm, which must be at rest; a line scanner is swept."""
     name, device = device_of_kind(session, DeviceKind.RANGE_SCANNER)
@@ -215,6 +264,13 @@ def base_from(session: Session, device: str) -> UncertainPose:
     """Return the present pose of a mounted device, with the covariance of its calibration."""
     cell: Cell = session.connection.cell
     return frame_tree(cell, session.connection.mover.state().base_from_flange).base_from(device)
+
+
+def camera_over_panel(session: Session) -> Array:
+    """Return the panel point (3,) in front of which the camera is."""
+    camera = base_from(session, session.first(DeviceKind.CAMERA)).parent_from_child
+    x, y, _ = session.known_panel().parent_from_child.inv().apply(camera.translation)
+    return np.array([x, y, 0.0])
 
 
 def _switch(session: Session, name: str, lights: Any, on: tuple[bool, ...], wait_s: float) -> None:

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Array
 from hal.devices import DeviceKind
-from hal.errors import NotFound, PerceptionError, Unreachable
+from hal.errors import NotFound, NotObservable, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject, Toggle
 from manipulation import visiting_order
@@ -25,7 +24,7 @@ from perception.vision import (
     viewpoints,
 )
 from perception.vision import inspect as inspect_image
-from service.operations.acquisition import Look, Scan, base_from, look, settle
+from service.operations.acquisition import Look, Scan, better_exposure_s, camera_over_panel, exposed, look, settle
 from service.operations.locate import go_to_overview, locate_from_overview, offset_m
 from service.operations.range_detection import half_hidden, read_by_height, scan_beside, sides_by_sight
 from service.operations.session import Session, panel_object_or_all
@@ -39,6 +38,7 @@ from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
 TURNED = "an earlier look showed the other state: look from the side, where the bat is not seen from its end"
+FURTHER = 2  # looks with another exposure
 MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
@@ -174,13 +174,6 @@ def close_ups(session: Session, names: Collection[str]) -> Inspection:
     return Inspection(readings=readings, pictures=tuple(pictures), scans=tuple(scans))
 
 
-def camera_over_panel(session: Session) -> Array:
-    """Return the panel point (3,) in front of which the camera is."""
-    camera = base_from(session, session.first(DeviceKind.CAMERA)).parent_from_child
-    x, y, _ = session.known_panel().parent_from_child.inv().apply(camera.translation)
-    return np.array([x, y, 0.0])
-
-
 def look_close(
     session: Session,
     centre_m: Iterable[float],
@@ -193,7 +186,33 @@ def look_close(
     title = f"close-up of {', '.join(names)}"
     go_to_camera_view(session, viewpoints.close_up_poses(pose, tuple(centre_m), distance_m), name=title[:60])
     settle(session)
-    return inspect_here(session, names, title=title)
+    return inspect_exposed(session, names, title=title)
+
+
+def inspect_exposed(session: Session, names: Collection[str], *, title: str, further: int = FURTHER) -> Inspection:
+    """Read objects from the present pose of the camera, and with other exposures those that are too dark or too bright.
+
+    Args:
+        further: how many looks there may be after the first.
+    """
+    seen = look(session)
+    try:
+        found = inspect_here(session, names, seen, title=title)
+    except NotObservable:  # all of the image is black, or saturated
+        if further == 0 or (exposure_s := better_exposure_s(session, seen, ())) is None:
+            raise
+        with exposed(session, seen.camera, exposure_s):
+            return inspect_exposed(session, names, title=title, further=further - 1)
+    unread = [one for one in found.readings.values() if not one.answered]
+    outlines_px = [one.outline_px for one in unread]
+    exposure_s = better_exposure_s(session, seen, outlines_px) if unread and further > 0 else None
+    if exposure_s is None:
+        return found
+    with exposed(session, seen.camera, exposure_s):
+        other = f"{', '.join(one.name for one in unread)}, exposed for {1e3 * exposure_s:.2g} ms"
+        again = inspect_exposed(session, [one.name for one in unread], title=other, further=further - 1)
+    told = {one.name: merge_views([one, again.readings[one.name]]) for one in unread}
+    return replace(found, readings=found.readings | told, pictures=(*found.pictures, *again.pictures))
 
 
 def look_past(session: Session, found: Inspection) -> Inspection:

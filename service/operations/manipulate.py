@@ -21,7 +21,8 @@ from hal.panel import PanelObject, Shown
 from manipulation import ObjectState, Outcome, SkillReport, Verify, free_hand, operate
 from perception.vision import ObjectReading, said
 from service.feasibility import target_of, text_of
-from service.operations.inspect import camera_over_panel, ensure_located, look_close, look_past, tell
+from service.operations.acquisition import camera_over_panel
+from service.operations.inspect import ensure_located, look_close, look_past, tell
 from service.operations.locate import OFF_PLACE_M, ensure_space_is_known, look_again
 from service.operations.session import Session
 from service.operations.travel import park, skill_context

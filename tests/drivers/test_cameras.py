@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.drivers.camera_benches import NumberedPictures
 from benchmarks.drivers.local_cameras import ScriptedGrabbers, v4l2_of
-from drivers.camera_v4l2 import CameraV4l2, CameraV4l2Options
+from drivers.camera_v4l2 import IN_WORK, CameraV4l2, CameraV4l2Options
 from drivers.kinds.file_player import undamaged_png
 from hal.camera_settings import CameraSettings
 from hal.conformance import CameraContract, RangeScannerContract, Rig
@@ -54,7 +54,7 @@ class FakeGrabber:
 
     size_px = (32, 24)
     rate_hz = 100.0
-    settings = CameraSettings(pixel_format="MJPG", exposure_s=0.004, gain_db=7.0)
+    settings = CameraSettings(pixel_format="MJPG", exposure_s=0.004, gain_db=7.0, exposure_range_s=(1e-4, 0.01))
     stamp_s: float | None = None
 
     def captured_s(self) -> float | None:
@@ -65,6 +65,11 @@ class FakeGrabber:
         self.is_broken = False
         self.is_silent = False
         self.rest = threading.Event()
+        self.exposures_s: list[float] = []
+
+    def set_exposure(self, exposure_s: float) -> float | None:
+        self.exposures_s.append(exposure_s)
+        return 1e-4 * round(exposure_s / 1e-4)
 
     def read(self) -> tuple[bool, np.ndarray[Any, Any]]:
         self.rest.wait(0.01)
@@ -219,13 +224,29 @@ def test_a_frame_that_was_held_up_is_given_only_with_the_kernel_s_stamp(has_stam
 def test_a_frame_that_lay_in_a_buffer_is_not_given_as_fresh_and_settings_are_reported() -> None:
     grabber = FakeGrabber()
     device = v4l2(grabber)
-    assert device.capabilities().settings == CameraSettings(pixel_format="MJPG", exposure_s=0.004, gain_db=7.0)
+    assert device.capabilities().settings == FakeGrabber.settings
     grabber.stamp_s = CLOCK.now_s() - 0.5
     with pytest.raises(DeviceTimeout):
         device.read_image(deadline=soon(0.1))
     assert device.capabilities().settings.stamped_by == "device"
     grabber.stamp_s = None
     assert device.read_image(deadline=soon()).value.exposure_s == 0.004
+    device.close()
+
+
+def test_frames_that_were_in_work_when_the_exposure_was_set_are_left_out_and_a_silent_camera_is_told() -> None:
+    grabber = FakeGrabber()
+    device = v4l2(grabber)
+    device.set_exposure(0.00123, deadline=soon())
+    frames = grabber.frames
+    sample = device.read_image(deadline=soon()).value
+    assert grabber.exposures_s == [0.00123] and sample.exposure_s == pytest.approx(0.0012)
+    assert grabber.frames - frames >= IN_WORK, "the first frames may have been begun before"
+    grabber.is_silent = True
+    with pytest.raises(DeviceTimeout, match="camera"):
+        device.set_exposure(0.002, deadline=soon(0.05))
+    grabber.is_silent = False
+    assert device.read_image(deadline=soon()).value.exposure_s == pytest.approx(0.0012), "nobody waits for it any more"
     device.close()
 
 

@@ -8,6 +8,7 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,14 @@ import psutil
 import pytest
 
 from drivers.gige.aravis import AravisCamera, library
-from drivers.gige.camera import GigeCamera
+from drivers.gige.camera import IN_WORK, GigeCamera
 from drivers.gige.frames import Frame
 from drivers.gige.settings import GigeCameraOptions
 from drivers.kinds.pixel_formats import FORMATS, decode
 from drivers.transport.link import BadAnswer, now_s
 from hal.camera_settings import CameraSettings
 from hal.conformance import CameraContract, Rig
-from hal.errors import DeviceTimeout, DeviceUnavailable
+from hal.errors import DeviceTimeout, DeviceUnavailable, Unsupported
 from hal.registry import Context, connect
 from tests.drivers.far_cameras import ADDRESS, FakeGigeCamera, fake_gige
 from tests.drivers.rigs import CLOCK, soon, until
@@ -59,7 +60,9 @@ def test_settings_are_written_and_read_back(far_side: FakeGigeCamera) -> None:
     device = gige(offset_x_px=16, gain_db=3.0, pixel_format="RGB8", features={"BinningHorizontal": 1})
     c = device.capabilities()
     assert (c.width_px, c.height_px, c.is_colour) == (128, 96, True)
-    assert c.settings == CameraSettings(pixel_format="RGB8", exposure_s=0.002, gain_db=3.0, stamped_by="device")
+    assert c.settings.exposure_range_s == pytest.approx((1e-5, 10.0), rel=1.0)
+    expected = CameraSettings(pixel_format="RGB8", exposure_s=0.002, gain_db=3.0, stamped_by="device")
+    assert replace(c.settings, exposure_range_s=None) == expected
     image = device.read_image(deadline=soon()).value
     assert image.pixels.shape == (96, 128, 3) and image.exposure_s == 0.002
     device.close()
@@ -146,7 +149,10 @@ class Script:
     """Source of frames that a test writes; `trigger` calls what the test gives."""
 
     width_px, height_px = 4, 2
-    settings = CameraSettings(pixel_format="Mono8", exposure_s=0.001, stamped_by="device")
+    settings = CameraSettings(
+        pixel_format="Mono8", exposure_s=0.001, stamped_by="device", exposure_range_s=(1e-5, 0.1)
+    )  # fmt: skip
+    exposed_s = 0.001
 
     def __init__(self) -> None:
         self.frames: deque[Frame] = deque()
@@ -166,7 +172,10 @@ class Script:
         self.frames.append(answer or frame(self.triggers))
 
     def exposure_s(self) -> float | None:
-        return 0.001
+        return self.exposed_s
+
+    def set_exposure(self, exposure_s: float) -> None:
+        self.exposed_s = exposure_s
 
     def check(self) -> None:
         pass
@@ -222,6 +231,36 @@ def test_a_damaged_frame_is_a_typed_error_and_never_a_value(bad: dict[str, Any],
     assert device.mailbox.published == 1
     script.frames.extend([frame(3), frame(4)])
     until(lambda: device.mailbox.published >= 2)
+    device.close()
+
+
+@pytest.mark.parametrize(("trigger", "left_out"), [("free-run", IN_WORK), ("software", 0)])
+def test_frames_in_work_when_the_exposure_was_set_are_left_out(trigger: str, left_out: int) -> None:
+    script = Script()
+    if trigger == "free-run":
+        script.frames.append(frame(1, value=1))
+    device = scripted(script, trigger=trigger)
+    until(lambda: device.mailbox.published == 1)
+    device.set_exposure(0.004, deadline=soon())
+    assert device.capabilities().settings.exposure_s == script.exposed_s == 0.004
+    if trigger == "software":
+        script.on_trigger = [frame(n, value=n) for n in (2, 3)]
+    else:
+        script.frames.extend(frame(n, value=n, arrived_s=now_s() + 0.1, device_s=now_s() + 0.1) for n in (2, 3, 4))
+    sample = device.read_image(deadline=soon()).value
+    assert (int(sample.pixels[0, 0]), sample.exposure_s) == (2 + left_out, 0.004)
+    device.close()
+
+
+def test_a_camera_that_chooses_its_exposure_is_left_alone() -> None:
+    script = Script()
+    script.settings = replace(Script.settings, exposure_range_s=None)
+    script.frames.append(frame(1))
+    device = scripted(script)
+    until(lambda: device.mailbox.published == 1)
+    with pytest.raises(Unsupported, match="eye") as caught:
+        device.set_exposure(0.004, deadline=soon())
+    assert "devices.eye.options.exposure_s" in caught.value.hint
     device.close()
 
 

@@ -6,13 +6,14 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.realsense.devices import ColourOptions, DepthOptions, RealsenseColour, RealsenseDepth
+from drivers.realsense.devices import IN_WORK, ColourOptions, DepthOptions, RealsenseColour, RealsenseDepth
 from drivers.realsense.stream import RealsenseFrame, StreamFacts
 from drivers.transport.link import LinkLost, now_s
 from hal.calibration import CameraIntrinsics
@@ -169,7 +170,7 @@ class Script:
 
     def __init__(self, *, is_rectified: bool = True) -> None:
         lens = CameraIntrinsics(width_px=4, height_px=2, fx_px=4.0, fy_px=4.0, cx_px=1.5, cy_px=0.5)
-        settings = CameraSettings(latency_s=0.01, stamped_by="device")
+        settings = CameraSettings(latency_s=0.01, stamped_by="device", exposure_s=0.01, exposure_range_s=(1e-4, 0.1))
         self.facts = StreamFacts(
             intrinsics=lens, is_rectified=is_rectified, rate_hz=100.0, settings=settings, serial="7"
         )
@@ -182,6 +183,9 @@ class Script:
             return self.frames.popleft()
         self._rest.wait(min(timeout_s, 0.002))
         return None
+
+    def set_exposure(self, exposure_s: float) -> None:
+        self.facts = replace(self.facts, settings=replace(self.facts.settings, exposure_s=exposure_s))
 
     def check(self) -> None:
         if self.is_gone:
@@ -251,6 +255,23 @@ def test_an_unplugged_camera_is_told_and_a_silent_one_too() -> None:
 def test_a_lens_that_a_range_image_cannot_have_is_refused() -> None:
     device = scripted(Script(is_rectified=False))
     until(lambda: isinstance(device.mailbox.error(), Unsupported))
+    device.close()
+
+
+def test_frames_in_work_when_the_exposure_was_set_are_left_out() -> None:
+    script = Script()
+    device = RealsenseColour(Context(name="eye"), ColourOptions(rate_hz=100), lambda: script)
+    device.port.start()
+    until(lambda: device.port.link is not None)
+    device.set_exposure(0.004, deadline=soon())
+    assert device.capabilities().settings.exposure_s == 0.004
+    script.frames.extend(
+        RealsenseFrame(number=n, device_s=now_s(), arrived_s=now_s(), data=np.full((2, 4, 3), n, np.uint8))
+        for n in range(1, 6)
+    )
+    until(lambda: device.mailbox.published == 5 - IN_WORK)
+    first = device.mailbox.since(0)[0][0].value
+    assert (int(first.pixels[0, 0, 0]), first.exposure_s) == (1 + IN_WORK, 0.004)
     device.close()
 
 

@@ -18,7 +18,7 @@ from hal.simulated import Fault
 from manipulation.skills.context import panel_from_grip
 from perception.vision import viewpoints
 from perception.vision.reading import ANSWER_AT, ObjectReading, answer_at
-from service.operations import inspect, locate, manipulate, range_detection
+from service.operations import acquisition, inspect, locate, manipulate, range_detection
 from service.operations.inspect import Inspection, close_ups, inspect_close
 from service.operations.session import Session
 from service.operations.travel import skill_context
@@ -226,8 +226,8 @@ def test_a_second_look_without_a_stroke_between_is_taken_from_beside(session: Se
     for _ in range(2):
         seen = verify()
         assert seen is not None and seen.value == pytest.approx(truth, abs=2.0)
-        places.append(inspect.camera_over_panel(session))
+        places.append(acquisition.camera_over_panel(session))
     assert np.linalg.norm(places[1] - places[0]) == pytest.approx(manipulate.BESIDE_M, abs=0.002)
     straight_look(session)  # of another object: the arm has moved, as it does in a stroke
     assert verify() is not None
-    np.testing.assert_allclose(inspect.camera_over_panel(session), places[0], atol=0.002)
+    np.testing.assert_allclose(acquisition.camera_over_panel(session), places[0], atol=0.002)

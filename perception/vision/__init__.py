@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from perception.vision.inspection import inspect, inspect_view
     from perception.vision.knowledge import Knowledge, TaughtKind
     from perception.vision.knowledge_files import kind_files, kind_text, load_kind, load_knowledge, write_kind
-    from perception.vision.lights import AssignedLights, PanelPrior, find_panel, find_panel_lights
+    from perception.vision.lights import PanelPrior, find_panel, find_panel_lights
     from perception.vision.multi_view import merge_views
     from perception.vision.panel_ways.looks import find_by_looks
     from perception.vision.panel_ways.outline import find_by_outline
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from perception.vision.warm import warm_up
 
 __all__ = [
-    "AssignedLights",
     "CameraProjection",
     "Knowledge",
     "ObjectReading",

@@ -6,7 +6,7 @@ A line scanner is swept by the wrist, and its lines become the depth image that 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,6 +38,7 @@ LONGEST_PASS_S = 20.0  # of the two passes of a sweep
 # What cannot be read is looked at with another exposure if its bright parts, the gray level that 5 % of it exceed, are far
 # from BRIGHT, or if more than GLARED of it is saturated, which does not say by how much.
 BRIGHT, BRIGHT_QUANTILE, SATURATED, GLARED, GLARE_FACTOR = 180.0, 95.0, 250, 0.05, 0.3
+FURTHER = 2  # looks with another exposure
 LEAST_CHANGE, MOST_CHANGE = 1.5, 8.0  # of an exposure, as a factor
 
 
@@ -209,6 +210,14 @@ def _light_factor(pixels: NDArray[np.uint8], boxes_px: Sequence[Array]) -> float
         return GLARE_FACTOR
     bright = max(float(np.percentile(meant, BRIGHT_QUANTILE)), 1.0)
     return min(max(BRIGHT / bright, 1.0 / MOST_CHANGE), MOST_CHANGE)
+
+
+def in_better_light(
+    session: Session, seen: Look, boxes_px: Sequence[Array] = ()
+) -> AbstractContextManager[None] | None:
+    """Return a context in which the camera has `better_exposure_s`; None if there is no better one."""
+    exposure_s = better_exposure_s(session, seen, boxes_px)
+    return None if exposure_s is None else exposed(session, seen.camera, exposure_s)
 
 
 @contextmanager

@@ -17,7 +17,6 @@ from hal.devices import DeviceKind
 from hal.errors import InvalidRequest, NotFound, PerceptionError
 from hal.geometry import UncertainPose, compose, matrix_of
 from perception.vision import (
-    AssignedLights,
     PanelPrior,
     PanelSighting,
     PanelWay,
@@ -28,7 +27,7 @@ from perception.vision import (
     find_panel,
     find_panel_lights,
 )
-from service.operations.acquisition import LightPair, Look, look, look_with_lights, settle
+from service.operations.acquisition import FURTHER, LightPair, Look, in_better_light, look, look_with_lights, settle
 from service.operations.session import Session
 from service.operations.stored import knowledge_of
 from service.schema.results import PanelCheck
@@ -89,20 +88,34 @@ def locate(session: Session, by: PanelWay | None = None) -> Located:
             f"the panel cannot be found by its {by} in cell {session.cell.name!r}",
             hint=f"this cell can use: {', '.join(ways)}; lights need a device of kind lights, tags need [[tags]]",
         )
-    wanted = (by,) if by is not None else ways
-    if wanted[0] is PanelWay.LIGHTS:
-        session.progress(0.3, "lights off, lights on")
-        pair = look_with_lights(session)
-        session.progress(0.8, "pose of the four lights")
-        found = by_lights(session, pair)
-    else:
-        session.progress(0.3, "look at the panel")
-        settle(session)
-        found = in_look(session, look(session), wanted)
+    found = _in_any_light(session, (by,) if by is not None else ways, further=FURTHER)
     session.world.believe_panel(found.base_from_panel)
     if found.contradictions:
         session.progress(1.0, "two ways of finding the panel disagree", "; ".join(found.contradictions))
     return found
+
+
+def _in_any_light(session: Session, ways: tuple[PanelWay, ...], *, further: int) -> Located:
+    """Find the panel by the first of the ways that does, and with other exposures in an image that is too dark or too bright.
+
+    `further`: how many looks there may be after the first.
+    """
+    try:
+        if ways[0] is not PanelWay.LIGHTS:
+            session.progress(0.3, "look at the panel")
+            settle(session)
+            return in_look(session, look(session), ways)
+        session.progress(0.3, "lights off, lights on")
+        pair = look_with_lights(session)
+        session.progress(0.8, "pose of the four lights")
+        return by_lights(session, pair)
+    except PerceptionError as lost:
+        better = in_better_light(session, look(session)) if further > 0 else None
+        if better is None:
+            raise
+        session.progress(0.3, "look with another exposure", lost.what)
+        with better:
+            return _in_any_light(session, ways, further=further - 1)
 
 
 def by_lights(session: Session, pair: LightPair) -> Located:
@@ -159,19 +172,6 @@ def in_look(session: Session, taken: Look, ways: tuple[PanelWay, ...]) -> Locate
     )
 
 
-def lights_in(session: Session, pair: LightPair) -> AssignedLights:
-    """Find the panel's lights in a pair of images, in the order of the panel file.
-
-    Raises:
-        NotFound, Ambiguous: not all of them are visible, or other lights are in their places.
-    """
-    taken = pair.on
-    upright = taken.base_from_camera.parent_from_child.inv() * session.believed_panel().parent_from_child
-    return find_panel_lights(
-        pair.off.pixels, pair.on.pixels, _lights_m(session), taken.intrinsics, upright=matrix_of(upright)
-    )
-
-
 def reference_points_m(session: Session) -> Array:
     """Return the points (N, 3) by which a camera is calibrated: the lights, or else the corners of all tags.
 
@@ -197,7 +197,11 @@ def reference_in_view(session: Session) -> tuple[Array, Array]:
     """
     way = ways_of(session)[0]
     if way is PanelWay.LIGHTS:
-        lights = lights_in(session, look_with_lights(session))
+        pair = look_with_lights(session)
+        upright = pair.on.base_from_camera.parent_from_child.inv() * session.believed_panel().parent_from_child
+        lights = find_panel_lights(
+            pair.off.pixels, pair.on.pixels, _lights_m(session), pair.on.intrinsics, upright=matrix_of(upright)
+        )
         return lights.points_px, lights.covariance_px
     settle(session)
     taken = look(session)
@@ -244,14 +248,10 @@ def _checks(session: Session, taken: Look, seen: PanelSighting, ways: tuple[Pane
             )
         checks.append(
             PanelCheck(
-                way=way.value,
-                position_m=compared.position_m,
-                angle_rad=compared.angle_rad,
-                chi_square=compared.chi_square,
-                contradicts=compared.contradicts,
-                finding=finding,
+                way=way.value, position_m=compared.position_m, angle_rad=compared.angle_rad,
+                chi_square=compared.chi_square, contradicts=compared.contradicts, finding=finding,
             )
-        )
+        )  # fmt: skip
     return tuple(checks)
 
 
@@ -263,18 +263,13 @@ def _located(seen: PanelSighting, taken: Look, lit: Look | None, checks: tuple[P
     source = lit or taken
     rays = [
         PixelObservation(
-            sensor=source.camera,
-            base_from_flange=source.base_from_flange,
-            name=name,
-            point_m=point_m,
-            pixel_px=pixel,
-            covariance_px=covariance,
-            intrinsics=source.intrinsics,
+            sensor=source.camera, base_from_flange=source.base_from_flange, name=name, point_m=point_m, pixel_px=pixel,
+            covariance_px=covariance, intrinsics=source.intrinsics,
         )
         for name, point_m, pixel, covariance in zip(
             seen.names, seen.points_m, seen.points_px, seen.covariance_px, strict=True
         )
-    ]
+    ]  # fmt: skip
     return Located(
         base_from_panel=compose(source.base_from_camera, seen.camera_from_panel),
         seen=seen,

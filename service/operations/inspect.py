@@ -24,7 +24,7 @@ from perception.vision import (
     viewpoints,
 )
 from perception.vision import inspect as inspect_image
-from service.operations.acquisition import Look, Scan, better_exposure_s, camera_over_panel, exposed, look, settle
+from service.operations.acquisition import FURTHER, Look, Scan, camera_over_panel, in_better_light, look, settle
 from service.operations.locate import go_to_overview, locate_from_overview, offset_m
 from service.operations.range_detection import half_hidden, read_by_height, scan_beside, sides_by_sight
 from service.operations.session import Session, panel_object_or_all
@@ -38,7 +38,6 @@ from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
 TURNED = "an earlier look showed the other state: look from the side, where the bat is not seen from its end"
-FURTHER = 2  # looks with another exposure
 MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
@@ -199,17 +198,18 @@ def inspect_exposed(session: Session, names: Collection[str], *, title: str, fur
     try:
         found = inspect_here(session, names, seen, title=title)
     except NotObservable:  # all of the image is black, or saturated
-        if further == 0 or (exposure_s := better_exposure_s(session, seen, ())) is None:
+        better = in_better_light(session, seen) if further > 0 else None
+        if better is None:
             raise
-        with exposed(session, seen.camera, exposure_s):
+        with better:
             return inspect_exposed(session, names, title=title, further=further - 1)
     unread = [one for one in found.readings.values() if not one.answered]
     outlines_px = [one.outline_px for one in unread]
-    exposure_s = better_exposure_s(session, seen, outlines_px) if unread and further > 0 else None
-    if exposure_s is None:
+    better = in_better_light(session, seen, outlines_px) if unread and further > 0 else None
+    if better is None:
         return found
-    with exposed(session, seen.camera, exposure_s):
-        other = f"{', '.join(one.name for one in unread)}, exposed for {1e3 * exposure_s:.2g} ms"
+    with better:
+        other = f"{', '.join(one.name for one in unread)} with another exposure"
         again = inspect_exposed(session, [one.name for one in unread], title=other, further=further - 1)
     told = {one.name: merge_views([one, again.readings[one.name]]) for one in unread}
     return replace(found, readings=found.readings | told, pictures=(*found.pictures, *again.pictures))

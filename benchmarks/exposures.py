@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.behind_cables import ANSWERS, BENCH, open_session, verdict
 from hal.config import load_cell
 from hal.devices import DeviceKind
-from hal.errors import NotObservable, PerceptionError
+from hal.errors import PerceptionError
 from hal.simulated import ObjectTruth
 from perception.vision import viewpoints
 from perception.vision.reading import ObjectReading
@@ -93,12 +93,12 @@ def _verdict(session: Session, truth: ObjectTruth, reading: ObjectReading | None
 
 
 def _readings(session: Session, names: tuple[str, ...], read: Callable[[], Inspection]) -> dict[str, ObjectReading]:
-    """Return what is read of objects without memory of earlier looks; nothing in a picture that is black or saturated."""
+    """Return what is read of objects without memory of earlier looks; nothing in a picture that does not show the panel."""
     for name in names:
         session.world.forget_reading(name)
     try:
         return read().readings
-    except NotObservable:
+    except PerceptionError:
         return {}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.devices import DeviceKind
-from hal.errors import NotFound, NotObservable, PerceptionError, Unreachable
+from hal.errors import NotFound, PerceptionError, Unreachable
 from hal.geometry import compose
 from hal.panel import PanelObject, Toggle
 from manipulation import visiting_order
@@ -197,7 +197,7 @@ def inspect_exposed(session: Session, names: Collection[str], *, title: str, fur
     seen = look(session)
     try:
         found = inspect_here(session, names, seen, title=title)
-    except NotObservable:  # all of the image is black, or saturated
+    except PerceptionError:  # too little of the panel is visible
         better = in_better_light(session, seen) if further > 0 else None
         if better is None:
             raise

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.occluder_bands import cables_across
@@ -19,6 +20,7 @@ EDGE_SIGMA_PX = 0.25  # standard deviation of one edge point, image px, includin
 RESOLVED = 1.5  # widths of an edge; a wall that appears narrower merges with the face, and its foot cannot be located
 # Width of a sharp edge; the excess width times PULL is the shift of an edge by its neighbours, px.
 SHARP_PX, PULL = 1.8, 1.0
+GLARED_PULL = 0.5  # widths by which an edge shifts whose bright side is saturated, because its steepest part is cut off
 # Radii over the cap's; least share of the ring that is visible; tolerance in image px.
 RING, RING_SHARE, RING_NEAR_PX = (1.08, 1.5), 0.5, 2.0
 CLEAR_OF_RING = 1.6  # of the cap's radius; anything that crosses a circle of that size is no part of the button
@@ -55,7 +57,7 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     use = is_face | (foot_m is not None)
     slack = 1.2 / patch.image_px_per_m
     reach = np.where(is_face, outward * (high_m - low_m) / 2, 0.0) + slack
-    offset, found, width_px = _edges(patch, radius_m, a, middle, expected, reach)
+    offset, found, width_px, glared = _edges(patch, radius_m, a, middle, expected, reach)
     beyond_m = CLEAR_OF_RING * radius_m
     hidden = cables_across(patch, radius_m=beyond_m, own_rad=np.empty(0))
     if hidden is not None:
@@ -82,7 +84,8 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     if float(np.median(np.abs(measured - J @ solution) / sigma)) > 2.0:
         return None  # another edge was found, such as that of a printed ring
     lean = float(np.mean(outward[is_face]))
-    pull_m = PULL * max(width_px - SHARP_PX, 0.0) / patch.image_px_per_m / lean
+    pull_px = PULL * max(width_px - SHARP_PX, 0.0) + GLARED_PULL * glared * width_px
+    pull_m = pull_px / patch.image_px_per_m / lean
     return CapHeight(
         height_m=float(middle + solution[0]),
         sigma_m=float(np.hypot(np.sqrt(np.linalg.inv(N)[0, 0]), pull_m)),
@@ -117,10 +120,10 @@ def _on_ring(patch: Patch, radius_m: float, a: Array, outward: Array, at_plate_m
 
 def _edges(
     patch: Patch, radius_m: float, a: Array, z_m: float, expected_m: Array, reach_m: Array
-) -> tuple[Array, NDArray[np.bool_], float]:
+) -> tuple[Array, NDArray[np.bool_], float, float]:
     """Return the radial offset of the strongest edge near each expected offset, and whether it is an edge.
 
-    Also returns the typical width of the edges, image px.
+    Also returns the typical width of the edges, image px, and the share of them that have a saturated side.
     """
     t = np.linspace(-1.0, 1.0, 25)
     r = radius_m + expected_m[:, None] + reach_m[:, None] * t
@@ -135,4 +138,7 @@ def _edges(
     )
     steps = np.abs(np.diff(values, axis=1)).sum(axis=1)
     width = steps / np.maximum(strength, 1e-6) / patch.px_per_m * patch.image_px_per_m
-    return expected_m + reach_m * t[best], found, float(np.median(width[found])) if found.any() else np.inf
+    if not found.any():
+        return expected_m + reach_m * t[best], found, np.inf, 1.0
+    glared = float((values[found].max(axis=1) >= WHITE_LEVEL).mean())
+    return expected_m + reach_m * t[best], found, float(np.median(width[found])), glared

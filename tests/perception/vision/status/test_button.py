@@ -12,15 +12,15 @@ from hal.panel import LATCHED_SHARE, Button, Mushroom
 from perception.vision.patch import Patch
 from perception.vision.status import button
 from perception.vision.status.button import read_button
-from perception.vision.status.press import CapHeight
+from perception.vision.status.press import CapHeight, cap_height
 
 SIZE, PX_PER_M = 160, 2500.0
 LEAN = 0.42  # tangent of the camera's viewing angle
 BUTTON = Button(kind="button", name="hold", position_m=(0.0, 0.0), radius_m=0.013, latching=True)
 
 
-def seen_aslant(height_m: float, *, cap: int, ring: int, ring_m: float = 0.0157) -> Patch:
-    """Draw a cap that protrudes by `height_m`, on a flat ring on a bright plate."""
+def seen_aslant(height_m: float, *, cap: int, ring: int, ring_m: float = 0.0157, light: float = 1.0) -> Patch:
+    """Draw a cap that protrudes by `height_m`, on a flat ring on a bright plate; `light` multiplies the gray levels."""
     middle = (SIZE - 1) / 2
     parallax = np.array([LEAN * PX_PER_M, 0.0])
 
@@ -34,7 +34,8 @@ def seen_aslant(height_m: float, *, cap: int, ring: int, ring_m: float = 0.0157)
     for shape, gray in ((disc(ring_m, 0.0), ring), (cv2.convexHull(np.vstack([foot, top])), cap + 6), (top, cap)):
         cv2.fillConvexPoly(picture, shape, gray, cv2.LINE_AA, 4)
     rough = np.random.default_rng(0).normal(0.0, 1.5, picture.shape)
-    gray = np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 1.2) + rough), 0, 255).astype(np.uint8)
+    blurred = light * cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 1.2)
+    gray = np.clip(np.round(blurred + rough), 0, 255).astype(np.uint8)
     return Patch(
         gray=gray, colour=None, inside=np.ones(gray.shape, bool), px_per_m=PX_PER_M, image_px_per_m=PX_PER_M / 1.5,
         origin_px=np.array([middle, middle]), parallax_px_per_m=parallax, growth_per_m=1 / 0.3, plane_z_m=0.0,
@@ -45,6 +46,19 @@ def test_a_bright_cap_on_a_dark_ring_is_read() -> None:
     latched = BUTTON.height_m - BUTTON.pressed_depth_m
     assert read_button(seen_aslant(BUTTON.height_m, cap=90, ring=20), BUTTON).state == "released"
     assert read_button(seen_aslant(latched, cap=90, ring=20), BUTTON).state in ("pressed", None)
+
+
+@pytest.mark.parametrize("light", [2.0, 4.0, 8.0])
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_glare_that_cuts_off_the_edges_of_a_cap_makes_its_height_uncertain(light: float, share: float) -> None:
+    found = {}
+    for level in (1.0, light):
+        patch = seen_aslant(BUTTON.height_m - share * BUTTON.travel_m, cap=30, ring=150, light=level)
+        low_m, high_m = BUTTON.height_m - BUTTON.travel_m, BUTTON.height_m
+        found[level] = cap_height(patch, radius_m=BUTTON.radius_m, low_m=low_m, high_m=high_m, foot_m=0.0)
+    plain, glared = found[1.0], found[light]
+    assert plain is not None
+    assert glared is None or abs(glared.height_m - plain.height_m) < 2.5 * glared.sigma_m
 
 
 @pytest.mark.parametrize("depth", [0.6, 0.8, 1.0])

@@ -25,6 +25,7 @@ DISPLAY_CLEAR, LEAST_DIGITS = 0.8, 2
 DISPLAY_MOST = 0.75  # highest confidence of such a display
 GUESSED_MOST = 0.75  # highest confidence of a face whose pivot is guessed
 STEEP_MOST = 0.75  # highest confidence of a face that is seen steeply
+CONTRADICTED, CONTRADICTED_MOST = 0.025, 0.75  # of the scale, between two outlines; and highest confidence then
 TURNED = 2  # of the faces found first, which are looked at with other places of their pivots
 LEAST_FACE_PX = 24.0  # radius of a face that may be read
 NOTHING = (
@@ -40,10 +41,26 @@ class _Seen:
     reading: PatchReading
 
     @property
-    def rank(self) -> tuple[bool, float]:
-        """Whether it was read by numerals, and how surely: what else is round is no instrument beside one that has numerals."""
+    def rank(self) -> tuple[bool, float, float]:
+        """Whether it was read by numerals, how surely, and how much of its outline has an edge.
+
+        What else is round is no instrument beside one that has numerals.
+        """
         scale = self.reading.scale
-        return self.reading.answered and scale is not None and scale.by_numerals, self.reading.confidence
+        by_numerals = self.reading.answered and scale is not None and scale.by_numerals
+        return by_numerals, self.reading.confidence, self.face.coverage
+
+    def contradicts(self, other: _Seen) -> bool:
+        """Return whether another face of the same instrument was read as clearly, and shows another value."""
+        scale, one, two = self.reading.scale, self.reading.value, other.reading.value
+        if self.rank[0] != other.rank[0] or other.rank[1] < CLEAR or not _overlap(self.face, other.face):
+            return False
+        return (
+            scale is not None
+            and one is not None
+            and two is not None
+            and (abs(one - two) > CONTRADICTED * abs(scale.maximum - scale.minimum))
+        )
 
 
 def read_face_anywhere(image: Image, read: ReadFace, *, is_scene: bool) -> PatchReading:
@@ -142,6 +159,8 @@ def _one_of(seen: Sequence[_Seen]) -> PatchReading | None:
     ]  # fmt: skip
     if others:
         return doubted(best.reading, _several([_told(one.reading) for one in (best, *others)]))
+    if any(best.contradicts(one) for one in read[1:]):
+        return limited(best.reading, CONTRADICTED_MOST)
     return best.reading
 
 

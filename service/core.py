@@ -214,6 +214,8 @@ class Service:
                     sub.check()
 
             self.lease.check_in_time(command)  # again, because it may have waited in the queue
+            if sub is not None:
+                task.end_when(lambda: self._check_not_stopped_since(stops_seen))
             cell, stop = self.calibrations.applied(), self.supervisor.stop
             after = self.losses.followed(task.id, lambda: self._check_not_stopped_since(stops_seen))
             connection = GatedConnection(self.supervisor.connection, check_may_move, cell=cell, stop=stop, after=after)

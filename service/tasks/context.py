@@ -18,6 +18,7 @@ class TaskContext:
     def __init__(self, task: Task, folder: Path) -> None:
         self._task = task
         self._folder = folder
+        self._may_go_on: Callable[[], None] = lambda: None
 
     @property
     def id(self) -> str:
@@ -34,14 +35,20 @@ class TaskContext:
 
         Raises:
             Cancelled: the task was cancelled.
+            CellError: what ends it besides; see `end_when`.
         """
         self.check_cancelled()
+        self._may_go_on()
         self._task.add_event("progress", fraction=min(1.0, max(0.0, fraction)), step=step, detail=detail)
 
     def check_cancelled(self) -> None:
         """Raise `Cancelled` when cancellation of this task was requested."""
         if self.is_cancelled:
             raise self._task.cancellation()
+
+    def end_when(self, check: Callable[[], None]) -> None:
+        """Have `progress` call `check`, whose error ends the work before its next motion would."""
+        self._may_go_on = check
 
     def pause_point(self, hold: Callable[[], object]) -> None:
         """Stand still between two steps for as long as somebody wants a pause; `hold` is called again and again meanwhile.

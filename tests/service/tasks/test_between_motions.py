@@ -31,11 +31,15 @@ class Thinker:
     def __init__(self) -> None:
         self.thinks, self.may_go_on = threading.Event(), threading.Event()
         self.moved = 0
+        self.computes = False
 
     def run(self, context: OperationContext, _request: HoldRequest) -> dict[str, Any]:
         self._move(context)
         self.thinks.set()
         assert self.may_go_on.wait(PATIENCE_S)
+        if self.computes:
+            context.task.progress(0.5, "compute")
+            return HoldResult(held_s=0.0)
         self._move(context)
         return HoldResult(held_s=0.0)
 
@@ -86,6 +90,17 @@ def test_a_task_that_thought_while_the_stop_was_pressed_and_reset_moves_no_more(
     assert thinker.moved == 1
     again = service.submit("think", HoldRequest())
     assert again.wait(PATIENCE_S) and again.state is TaskState.SUCCEEDED, "a new command moves"
+
+
+def test_a_task_that_only_computes_when_the_stop_is_pressed_ends_at_its_next_report_of_progress(
+    service: Service, thinker: Thinker
+) -> None:
+    thinker.computes = True
+    task = service.submit("think", HoldRequest())
+    assert thinker.thinks.wait(PATIENCE_S)
+    service.supervisor.stop("test")
+    thinker.may_go_on.set()
+    assert "pressed after this task was asked for" in refused(task)
 
 
 def test_what_waited_in_the_queue_when_the_stop_was_pressed_does_not_move_after_the_reset(

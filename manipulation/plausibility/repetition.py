@@ -18,21 +18,25 @@ FROZEN_S, FROZEN_TICKS, FROZEN_PERIODS = 0.1, 10, 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDigest:
-    """A frame of a camera or range scanner: when it was taken (cell clock, s) and a digest of its array."""
+    """A frame of a camera or range scanner: when it was taken (cell clock, s) and a digest of its array.
+
+    `is_blank`: whether all of it has one value, as of a saturated picture, in which noise does not show.
+    """
 
     stamp_s: float
     digest: bytes
+    is_blank: bool = False
 
     @classmethod
     def of(cls, array: NDArray[np.generic], *, stamp_s: float) -> FrameDigest:
         """Return the frame of an array."""
         digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).digest()
-        return cls(stamp_s=stamp_s, digest=digest)
+        return cls(stamp_s=stamp_s, digest=digest, is_blank=bool((array == array.flat[0]).all()))
 
 
 def repeated_frame(device: str, before: FrameDigest | None, newest: FrameDigest) -> Finding | None:
     """Find a device that sent the same frame again under another time stamp."""
-    if before is None or before.digest != newest.digest or before.stamp_s == newest.stamp_s:
+    if before is None or before.digest != newest.digest or before.stamp_s == newest.stamp_s or newest.is_blank:
         return None
     return Finding(
         device=device,

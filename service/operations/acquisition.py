@@ -200,11 +200,11 @@ def better_exposure_s(session: Session, seen: Look, boxes_px: Sequence[Array]) -
 
 def _light_factor(pixels: NDArray[np.uint8], boxes_px: Sequence[Array]) -> float:
     """Return by what the light on some boxes of an image should be multiplied."""
-    height, width = pixels.shape[:2]
-    is_meant = np.zeros((height, width), bool)
+    is_meant = np.zeros(pixels.shape[:2], bool)
     for points in boxes_px:
-        (left, top), (right, bottom) = np.floor(np.min(points, axis=0)), np.ceil(np.max(points, axis=0))
-        is_meant[max(0, int(top)) : max(0, int(bottom)), max(0, int(left)) : max(0, int(right))] = True
+        seen = np.clip(np.nan_to_num(points), 0, is_meant.shape[::-1])  # what lies behind the camera has no pixel
+        (left, top), (right, bottom) = seen.min(axis=0).astype(int), np.ceil(seen.max(axis=0)).astype(int)
+        is_meant[top:bottom, left:right] = True
     meant = pixels[is_meant if is_meant.any() else ~is_meant]
     if np.mean(meant >= SATURATED) > GLARED:
         return GLARE_FACTOR

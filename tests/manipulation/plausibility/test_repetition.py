@@ -79,3 +79,8 @@ def test_a_frame_that_comes_again_under_a_new_stamp_names_its_camera() -> None:
 def test_a_first_frame_the_same_one_and_another_are_no_repetition(before: np.ndarray | None, stamp_s: float) -> None:
     earlier = None if before is None else FrameDigest.of(before, stamp_s=1.0)
     assert repeated_frame("eye", earlier, FrameDigest.of(PICTURE, stamp_s=stamp_s)) is None
+
+
+def test_a_saturated_picture_that_comes_again_is_no_frozen_one() -> None:
+    white = np.full_like(PICTURE, 255)
+    assert repeated_frame("eye", FrameDigest.of(white, stamp_s=1.0), FrameDigest.of(white, stamp_s=1.1)) is None

@@ -38,6 +38,7 @@ from service.schema.results import InspectResult
 
 TIPS_M = 0.085  # least distance of the finger tips from the plate in a side view, because cables hang in front of it
 TURNED = "an earlier look showed the other state: look from the side, where the bat is not seen from its end"
+OBJECTS = "objects of the panel file in the image"
 MOST_UNREAD = 4  # if more objects cannot be read at once, the cause is the light or the lens and not a cable
 
 
@@ -100,7 +101,7 @@ def inspect_here(
     names: Collection[str],
     seen: Look | None = None,
     *,
-    title: str = "objects of the panel file in the image",
+    title: str = OBJECTS,
 ) -> Inspection:
     """Read objects from the present pose of the camera."""
     view = seen or look(session)
@@ -188,11 +189,12 @@ def look_close(
     return inspect_exposed(session, names, title=title)
 
 
-def inspect_exposed(session: Session, names: Collection[str], *, title: str, further: int = FURTHER) -> Inspection:
+def inspect_exposed(
+    session: Session, names: Collection[str], *, title: str = OBJECTS, further: int = FURTHER
+) -> Inspection:
     """Read objects from the present pose of the camera, and with other exposures those that are too dark or too bright.
 
-    Args:
-        further: how many looks there may be after the first.
+    `further`: how many looks there may be after the first.
     """
     seen = look(session)
     try:
@@ -203,7 +205,7 @@ def inspect_exposed(session: Session, names: Collection[str], *, title: str, fur
             raise
         with better:
             return inspect_exposed(session, names, title=title, further=further - 1)
-    unread = [one for one in found.readings.values() if not one.answered]
+    unread = [one for one in found.readings.values() if not (one.answered or one.needs_closer_sides)]
     outlines_px = [one.outline_px for one in unread]
     better = in_better_light(session, seen, outlines_px) if unread and further > 0 else None
     if better is None:
@@ -272,7 +274,7 @@ def _from_the_sides(
         try:
             go_to_camera_view(session, clear, name=title[:60])
             settle(session)
-            closer = inspect_here(session, unread, title=title)
+            closer = inspect_exposed(session, unread, title=title)
         except (PerceptionError, Unreachable):
             continue
         yield from closer.pictures

@@ -28,7 +28,7 @@ from service.operations.find_panel import Located, locate, panel_observations, w
 from service.operations.inspect import (
     Inspection,
     inspect_close,
-    inspect_here,
+    inspect_exposed,
     need_all_present,
     places_in,
     reading_result,
@@ -154,7 +154,7 @@ def _run(worker: _Worker, interpreter: Interpreter) -> None:
     with _step(session, "recognise", 0.19, FOUND) as part:
         part.progress(0.0, "recognise the objects")
         settle(part)  # until the border lights are out
-        overview = inspect_here(part, [panel_object.name for panel_object in session.panel.objects])
+        overview = inspect_exposed(part, [panel_object.name for panel_object in session.panel.objects])
         _note_pictures(record, overview, "recognised")
         need_all_present(overview, session)
         record.objects = places_in(session, overview)

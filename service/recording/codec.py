@@ -22,7 +22,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.errors import CellError, ConfigError
 
 CLASSES = "$class"
-MODULES = ("hal.devices", "hal.readings", "hal.motion", "hal.calibration", "hal.simulated", "hal.geometry")
+MODULES = (
+    "hal.devices",
+    "hal.camera_settings",
+    "hal.readings",
+    "hal.motion",
+    "hal.calibration",
+    "hal.simulated",
+    "hal.geometry",
+)
 ERRORS = ("hal.errors", "service.errors")
 LISTED = 64  # elements; longer arrays are written as bytes, which are smaller and read faster
 

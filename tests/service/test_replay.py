@@ -181,13 +181,18 @@ def test_the_verdict_is_told_in_words(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("exposure_s", [0.01, 0.0002], ids=["light", "dark, so that other exposures are set"])
 def test_a_simulated_mission_is_replayed_to_the_last_bit(
-    tmp_path: Path, replayed: Callable[..., list[Verdict]]
+    tmp_path: Path, replayed: Callable[..., list[Verdict]], exposure_s: float
 ) -> None:
-    path = tmp_path / "mission.mcap"
-    service = Service(
-        load_cell(ROOT / "cells/bench.toml", seed=11), OPERATIONS, runs_dir=tmp_path / "runs", record=path
-    )
+    path, file = tmp_path / "mission.mcap", tmp_path / "bench.toml"
+    for name in ("panels", "cells"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    text = (ROOT / "cells/bench.toml").read_text(encoding="utf-8")
+    camera = "options = { width_px = 640, height_px = 480"
+    assert camera in text
+    file.write_text(text.replace(camera, f"{camera}, exposure_s = {exposure_s}"), encoding="utf-8")
+    service = Service(load_cell(file, seed=11), OPERATIONS, runs_dir=tmp_path / "runs", record=path)
     with conftest.running(service):
         wanted = WantedPose(position_m=0.0005, angle_rad=0.0005)  # so that the touches are part of the recording
         task = service.submit("missions", MissionRequest(actions=(), touches=3, wanted=wanted))
@@ -197,6 +202,8 @@ def test_a_simulated_mission_is_replayed_to_the_last_bit(
     assert (verdict.complaint, verdict.differences) == ("", ())
     assert verdict.same_bits
     assert verdict.calls > 40
+    asked = [call.method for task in open_recording(path).tasks for call in task.calls]
+    assert ("set_exposure" in asked) == (exposure_s < 0.01)
 
 
 def test_a_recording_without_the_end_of_a_task_is_replayed_as_far_as_it_goes(

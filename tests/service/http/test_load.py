@@ -235,3 +235,14 @@ def test_a_chunk_is_pushed_only_while_the_connection_has_room() -> None:
             assert not protocol.push(chunk)
 
     asyncio.run(story())
+
+
+def test_a_body_that_has_not_arrived_is_given_up_at_once_when_the_server_ends() -> None:
+    async def wait() -> None:
+        load = Load()
+        async with load.body_time(3600.0):
+            load.end()
+            await asyncio.wait([asyncio.ensure_future(asyncio.Event().wait())], timeout=10.0)
+
+    with pytest.raises(TimeoutError):
+        asyncio.run(wait())

@@ -248,8 +248,10 @@ def test_frames_in_work_when_the_exposure_was_set_are_left_out(trigger: str, lef
     else:
         script.frames.extend(frame(n, value=n, arrived_s=now_s() + 0.1, device_s=now_s() + 0.1) for n in (2, 3, 4))
     sample = device.read_image(deadline=soon()).value
-    assert (int(sample.pixels[0, 0]), sample.exposure_s) == (2 + left_out, 0.004)
     device.close()
+    assert (int(sample.pixels[0, 0]), sample.exposure_s) == (2 + left_out, 0.004)
+    published = [int(one.value.pixels[0, 0]) for one in device.mailbox.since(0)[0]]
+    assert published[1:] == [2 + left_out], "what was in work is not given to anybody"
 
 
 def test_a_camera_that_chooses_its_exposure_is_left_alone() -> None:

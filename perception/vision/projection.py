@@ -36,6 +36,10 @@ class PanelProjection(Protocol):
         """Return the view after a motion with parameters `delta` (n,)."""
         ...
 
+    def motion(self, points_m: ArrayLike) -> Array:
+        """Return the derivatives (N, 2, n) of the pixels of panel points (N, 3) over the motion parameters."""
+        ...
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraProjection:
@@ -66,6 +70,11 @@ class CameraProjection:
             intrinsics=self.intrinsics,
             camera_from_panel=UncertainPose(parent_from_child=pose, covariance=self.camera_from_panel.covariance),
         )
+
+    def motion(self, points_m: ArrayLike) -> Array:
+        """Return the derivatives (N, 2, 6) of the pixels over the perturbation, by finite differences."""
+        base, bumps = self.project(points_m), np.diag(1e-3 * self.prior_sigma)
+        return np.stack([(self.moved(bump).project(points_m) - base) / bump.sum() for bump in bumps], axis=2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,6 +111,19 @@ class PlateProjection:
             px_from_plate=homography(self.corners_m, shifted), corners_m=self.corners_m, sigma_px=self.sigma_px
         )
 
+    def motion(self, points_m: ArrayLike) -> Array:
+        """Return the derivatives (N, 2, 8) of the pixels over the coordinates of the control points.
+
+        The equations A h = u determine the homography's elements h by the control points' coordinates u. As A contains
+        u as well, dh = A^-1 diag(w) du with the points' depths w. Of any points it is du = diag(1 / w) A dh.
+        """
+        points = np.asarray(points_m, float)[:, :2]
+        of_points, of_corners = (_equations(at, self.project(at)) for at in (points, self.corners_m))
+        last = self.px_from_plate[2] / self.px_from_plate[2, 2]
+        depth, corner_depth = (np.tile(at @ last[:2] + 1.0, 2) for at in (points, self.corners_m))
+        J = (of_points / depth[:, None]) @ (np.linalg.inv(of_corners) * corner_depth)
+        return np.asarray(J.reshape(2, len(points), 2, 4).transpose(1, 0, 3, 2).reshape(len(points), 2, 8))
+
 
 def plate_by_corners(corners_px: ArrayLike, plate_m: tuple[float, float]) -> PlateProjection:
     """Return the view of an upright plate of known size whose corners (4, 2) were clicked, in any order.
@@ -130,11 +152,17 @@ def plate_by_corners(corners_px: ArrayLike, plate_m: tuple[float, float]) -> Pla
 
 def homography(source: Array, target: Array) -> Array:
     """Return the homography (3, 3) that maps four source points (4, 2) to four target points."""
-    A = np.zeros((8, 8))
-    x, y = source.T
-    u, v = target.T
-    A[:4, 0], A[:4, 1], A[:4, 2] = x, y, 1.0
-    A[:4, 6], A[:4, 7] = -u * x, -u * y
-    A[4:, 3], A[4:, 4], A[4:, 5] = x, y, 1.0
-    A[4:, 6], A[4:, 7] = -v * x, -v * y
-    return np.append(np.linalg.solve(A, np.concatenate([u, v])), 1.0).reshape(3, 3)
+    return np.append(np.linalg.solve(_equations(source, target), target.T.ravel()), 1.0).reshape(3, 3)
+
+
+def _equations(source: Array, target: Array) -> Array:
+    """Return the matrix A (2 N, 8) of the equations A h = u of a homography's elements h, of which the last one is 1.
+
+    The coordinates u of the targets (N, 2) are all those across, then all those down.
+    """
+    n = len(source)
+    A = np.zeros((2 * n, 8))
+    A[:n, :2] = A[n:, 3:5] = source
+    A[:n, 2] = A[n:, 5] = 1.0
+    A[:, 6:] = -target.T.reshape(-1, 1) * np.tile(source, (2, 1))
+    return A

@@ -50,6 +50,8 @@ EVEN, SCALE = 0.026, 0.020
 # the scales are 0.020 and 0.018.
 NOISY_MEAN_OF = 3
 NOISY_EVEN = 0.014
+Space = tuple[float, float, float]
+"""Middle (u, v) and size of an object, pixels of the rectified plate."""
 CROSS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 CENTRING_STEPS_PX = (2.0, 0.8)
 CIRCLE_RADII_M = (0.004, 0.042)
@@ -217,63 +219,63 @@ def chosen(
     best = kinds.argmin(axis=1)
     near = kinds.min(axis=1)
     size_m = np.array([max(kind.size_m) if kind.middles_m is None else 0.0 for kind in knowledge.kinds])
-    size_px = size_m[best] * PLATE_PX_PER_M
+    spaces = [(u, v, size) for u, v, size in np.column_stack([places, size_m[best] * PLATE_PX_PER_M]).tolist()]
     order = np.argsort(near - np.minimum(to_nothing, near + 0.3))
     waiting = order[near[order] <= np.minimum(to_nothing[order] + SECOND_LOOK, FURTHEST)].tolist()
-    taken = np.zeros((0, 3))
+    taken: list[Space] = []
     accepted, refused = [], []
     while waiting:
-        now, waiting = _apart(places, size_px, waiting, taken)
+        now, waiting = _apart(spaces, waiting, taken)
         if not now:
             break
         at = _centred(ground, places[now], known, best[now])
         seen_looks = look_at(ground, at)
         for i, place, look, seen in zip(now, at, seen_looks, nearest(seen_looks, known, mean_of=mean_of), strict=True):
-            if _is_taken(places[i], size_px[i], taken):
+            if _is_taken(spaces[i], taken):
                 continue
             to_other = float(seen[nothing]) if nothing is not None else np.inf
             if nothing is not None:
                 seen[nothing] = np.inf
             kind = knowledge.kinds[int(seen.argmin())]
-            middle = place
+            middle, size = place, max(kind.size_m) * PLATE_PX_PER_M
             if kind.middles_m is not None:
                 across, up = kind.middles_m[nearest_look(look, kind, knowledge)]
                 middle = place + np.array([across, -up]) * PLATE_PX_PER_M
-                if _is_taken(middle, max(kind.size_m) * PLATE_PX_PER_M, taken):
+                if _is_taken((*middle.tolist(), size), taken):
                     continue
             even = NOISY_EVEN if ground.noisy else EVEN
             candidate = _candidate(place, middle, names, seen, to_other, kind.size_m, view, plate_m, even=even)
             if candidate.reason is None:
-                taken = np.vstack([taken, [*middle, max(kind.size_m) * PLATE_PX_PER_M]])
+                taken.append((*middle.tolist(), size))
                 accepted.append(candidate)
             else:
                 refused.append(candidate)
     return (*accepted, *refused)
 
 
-def _apart(places: Array, size_px: Array, waiting: Sequence[int], taken: Array) -> tuple[list[int], list[int]]:
+def _apart(spaces: Sequence[Space], waiting: Sequence[int], taken: Sequence[Space]) -> tuple[list[int], list[int]]:
     """Return which of the waiting candidates overlap no better one, and which have to wait for what becomes of that one.
 
     Those that overlap an accepted object (`taken`) are in neither. A size of 0 means that the middle is not known yet.
     """
     now, later = [], []
-    claimed = taken
+    claimed: list[Space] = []
     for i in waiting:
-        if _is_taken(places[i], size_px[i], taken):
+        if _is_taken(spaces[i], taken):
             continue
-        if _is_taken(places[i], size_px[i], claimed):
+        if _is_taken(spaces[i], claimed):
             later.append(i)
             continue
         now.append(i)
-        if size_px[i] > 0:
-            claimed = np.vstack([claimed, [*places[i], size_px[i]]])
+        if spaces[i][2] > 0:
+            claimed.append(spaces[i])
     return now, later
 
 
-def _is_taken(place: Array, size_px: float, taken: Array) -> bool:
-    """Return whether an object overlaps one of `taken` (N, 3; place and size); one of size 0 does not."""
-    apart = np.abs(taken[:, :2] - place).max(axis=1)
-    return size_px > 0 and bool((apart < OVERLAP * np.maximum(taken[:, 2], size_px)).any())
+def _is_taken(space: Space, taken: Sequence[Space]) -> bool:
+    """Return whether an object overlaps one of `taken`; one of size 0 does not."""
+    u, v, size = space
+    return size > 0 and any(max(abs(u - x), abs(v - y)) < OVERLAP * max(size, other) for x, y, other in taken)
 
 
 def _refusal(near: float, confidence: float, rival: str) -> str | None:

@@ -246,7 +246,7 @@ def _corners(lines: list[Array | None], shape: tuple[int, ...], aspect: float, f
         np.array([1.0, 0.0, -0.5]),
     ]
     full = [line if line is not None else edge for line, edge in zip(lines, border, strict=True)]
-    corners = np.array([_cut(full[3], full[0]), _cut(full[0], full[1]), _cut(full[1], full[2]), _cut(full[2], full[3])])
+    corners = _cuts(np.roll(full, 1, axis=0), np.array(full))
     if not np.isfinite(corners).all():
         return None
     missing = [k for k, line in enumerate(lines) if line is None]
@@ -291,9 +291,8 @@ def _completed(corners: Array, missing: int, *, middle: Array, focal: float, asp
     return out
 
 
-def _cut(first: Array, second: Array) -> Array:
-    """Return the intersection of two lines; NaN if they are parallel."""
-    A = np.array([first[:2], second[:2]])
-    if abs(float(np.linalg.det(A))) < 1e-9:
-        return np.full(2, np.nan)
-    return np.asarray(np.linalg.solve(A, [first[2], second[2]]))
+def _cuts(first: Array, second: Array) -> Array:
+    """Return the intersections (N, 2) of lines (N, 3; a x + b y = c), by Cramer's rule; not finite if they are parallel."""
+    (a, b, c), (d, e, f) = first.T, second.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.stack([c * e - b * f, a * f - c * d], axis=1) / (a * e - b * d)[:, None])

@@ -58,6 +58,16 @@ class RigidPlate:
         turn = cv2.Rodrigues(np.asarray(delta[:3], float))[0]
         return replace(self, R=turn @ self.R, t_m=self.t_m + float(np.linalg.norm(self.t_m)) * delta[3:])
 
+    def motion(self, points_m: ArrayLike) -> Array:
+        """Return the derivatives (N, 2, 6) of the pixels of points (N, 2 or 3) of the plate's plane over the motion."""
+        turned = np.asarray(points_m, float)[:, :2] @ self.R[:, :2].T
+        x, y, z = (turned + self.t_m).T
+        by_shift = np.zeros((len(turned), 2, 3))
+        by_shift[:, 0, 0] = by_shift[:, 1, 1] = self.focal_px / z
+        by_shift[:, 0, 2], by_shift[:, 1, 2] = -self.focal_px * x / z**2, -self.focal_px * y / z**2
+        by_turn = np.cross(turned[:, None], by_shift)  # g . (e x a) = e . (a x g)
+        return np.concatenate([by_turn, float(np.linalg.norm(self.t_m)) * by_shift], axis=2)
+
 
 def rigid_plate(
     corners_m: Array, corners_px: Array, *, focal_px: float, middle_px: Array, sigma_px: float

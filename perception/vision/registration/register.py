@@ -97,7 +97,7 @@ def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
     reference = view
     delta = np.zeros(len(view.prior_sigma))
     for window in WINDOWS_PX:
-        motion = _motion(reference, delta, everything.points_m)
+        motion = reference.moved(delta).motion(everything.points_m)
         delta, covariance = _step(
             smooth, slope_noise, reference, delta, edges=everything, window_px=window, motion=motion
         )
@@ -144,7 +144,7 @@ def follow_edges(image: EdgeImage, view: V, outline: Outline, windows_px: Sequen
     windows_px: half lengths of the search, one after the other.
     """
     delta = np.zeros(len(view.prior_sigma))
-    motion = _motion(view, delta, outline.points_m)  # nearly constant within a dozen pixels
+    motion = view.motion(outline.points_m)  # nearly constant within a dozen pixels
     for window in windows_px:
         delta, _ = _step(image.smooth, image.slope_noise, view, delta, edges=outline, window_px=window, motion=motion)
     return view.moved(delta)
@@ -206,7 +206,7 @@ def _step(
 ) -> tuple[Array, Array]:  # fmt: skip
     """Do two Gauss-Newton steps on the edges found in one window; returns the motion parameters and their covariance.
 
-    `motion` (N, 2, P) is the result of `_motion`.
+    `motion` (N, 2, P) are the derivatives of the samples over the parameters.
     """
     sigma = reference.prior_sigma
     information = np.diag(1.0 / sigma**2)
@@ -245,17 +245,6 @@ def _normal_equations(motion: Array, normals_px: Array, offset_px: Array, ok: ND
             for j in range(count):
                 N[i, j] += weight * along[i] * along[j]
     return N, g
-
-
-def _motion(reference: PanelProjection, delta: Array, points_m: Array) -> Array:
-    """Return the derivatives (N, 2, P) of the projected points over the motion parameters, by finite differences."""
-    base = reference.moved(delta).project(points_m)
-    out = np.empty((len(points_m), 2, len(delta)))
-    for k, sigma in enumerate(reference.prior_sigma):
-        bump = np.zeros(len(delta))
-        bump[k] = 1e-3 * sigma
-        out[:, :, k] = (reference.moved(delta + bump).project(points_m) - base) / bump[k]
-    return out
 
 
 def fit_object(image: EdgeImage, view: PanelProjection, edges: Outline, built_m: float) -> ObjectFit:

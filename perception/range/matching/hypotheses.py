@@ -6,16 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Mask
 from perception.range.analysis import RangeScene
 from perception.range.matching.models import ComponentModel, Form, ModelSurface, MotionKind
 from perception.range.matching.solids import boxes_of, solid_of
 from perception.range.matching.verify import Solid, View
 from perception.range.primitives import Cylinder, Plane, Sphere, Surface
-
-Flags = NDArray[np.bool_]
 
 LEAST_HEIGHT_M = 0.002
 LEAST_PIXELS = 12
@@ -85,7 +82,7 @@ def pieces_of(scene: RangeScene, view: View) -> list[Piece]:
     return out + [_piece(in_panel[patch], view, None) for patch in _patches(loose)]
 
 
-def _and_its_patches(mine: Flags) -> list[Flags]:
+def _and_its_patches(mine: Mask) -> list[Mask]:
     """Return the mask of a surface and, if it is not connected, of each of its patches.
 
     The caps of two buttons at the same height are one surface, so each of them must be tried on its own.
@@ -94,7 +91,7 @@ def _and_its_patches(mine: Flags) -> list[Flags]:
     return [mine, *patches] if len(patches) > 1 else [mine]
 
 
-def _patches(mask: Flags) -> list[Flags]:
+def _patches(mask: Mask) -> list[Mask]:
     """Return the 4-connected patches of a mask that have at least `LEAST_PIXELS` pixels."""
     count, patch, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     return [patch == k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= LEAST_PIXELS]

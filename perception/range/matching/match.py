@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from hal.arrays import Array
+from hal.arrays import Array, Indices, Mask
 from hal.geometry import UncertainPose
 from perception.range.analysis import RangeScene
 from perception.range.matching.hypotheses import candidate_of, pieces_of
@@ -81,11 +80,12 @@ def match_models(
             return tuple(out)
         best = max(tries, key=lambda t: t.score)
         tries.remove(best)
-        evidence = explained(best.candidate.solid, best.q, view)
-        if not _holds(evidence.counts):
+        counts, rows, pixels = explained(best.candidate.solid, best.q, view)
+        if not _holds(counts):
             continue
-        out.append(_finished(best, scene, base, view))
-        view.depth_m[evidence.pixels] = np.nan
+        seen = float(counts[HITS] / max(counts[COVERED], 1.0))
+        out.append(_finished(best, base, view, seen, _labels(best.candidate.model, scene, rows, pixels)))
+        view.depth_m[pixels] = np.nan
         tries = [climb(t.candidate, t.q, view) for t in tries]
 
 
@@ -126,10 +126,9 @@ def _holds(counts: Array) -> bool:
     )
 
 
-def _finished(t: Try, scene: RangeScene, base: Surface, view: View) -> Match:
-    """Build the match of an accepted hypothesis, with its covariance and surface labels."""
+def _finished(t: Try, base: Surface, view: View, seen: float, labels: dict[str, int]) -> Match:
+    """Build the match of an accepted hypothesis, with its covariance."""
     model = t.candidate.model
-    evidence = explained(t.candidate.solid, t.q, view)
     x, y, yaw, state = t.q[:4]
     sensor_from_panel = RigidTransform.from_components(view.p, Rotation.from_matrix(view.R))
     panel_from_object = RigidTransform.from_components(np.array([x, y, 0.0]), Rotation.from_euler("z", yaw))
@@ -141,18 +140,16 @@ def _finished(t: Try, scene: RangeScene, base: Surface, view: View) -> Match:
         sensor_from_object=UncertainPose(
             parent_from_child=sensor_from_panel * panel_from_object, covariance=covariance
         ),
-        labels=_labels(model, scene, evidence.rows, evidence.pixels),
+        labels=labels,
         state=None if model.motion == MotionKind.NONE else float(state),
         state_sigma=None if model.motion == MotionKind.NONE else state_sigma,
         free=() if model.turns else ("turn about z",),
         score=t.score,
-        seen=float(evidence.counts[HITS] / max(evidence.counts[COVERED], 1.0)),
+        seen=seen,
     )
 
 
-def _labels(
-    model: ComponentModel, scene: RangeScene, rows: NDArray[np.int64], pixels: NDArray[np.bool_]
-) -> dict[str, int]:
+def _labels(model: ComponentModel, scene: RangeScene, rows: Indices, pixels: Mask) -> dict[str, int]:
     """Return for each surface of the model the label that most of its explained pixels have in the scene."""
     out: dict[str, int] = {}
     for k, surface in enumerate(model.surfaces):

@@ -7,17 +7,18 @@ normal.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hal.arrays import Array
 from hal.errors import ConfigError
+from hal.strict import read_text, toml_data
 
 
 class Form(StrEnum):
@@ -67,11 +68,11 @@ class ModelSurface:
     along: Array
     size_m: float
     half_angle_rad: float
-    sides_m: tuple[float, float] | None
+    sides_m: tuple[float, ...] | None
     length_m: float
     radii_m: Array
     tube_m: float
-    between_m: tuple[float, float]
+    between_m: tuple[float, ...]
     tolerance_m: float
     moves: bool
 
@@ -100,22 +101,8 @@ class ComponentModel:
         return 2.0 * math.pi / self.turns if self.turns else 0.0
 
 
-SURFACE_KEYS = {
-    "name",
-    "type",
-    "point_m",
-    "direction",
-    "along",
-    "size_m",
-    "half_angle_rad",
-    "sides_m",
-    "length_m",
-    "radii_m",
-    "tube_m",
-    "between_m",
-    "tolerance_m",
-    "moves",
-}
+SURFACE_KEYS = {field.name for field in fields(ModelSurface)}
+MODEL_KEYS = {field.name for field in fields(ComponentModel)} - {"name"}
 NEEDED = {
     Form.SPHERE: {"size_m"},
     Form.CYLINDER: {"size_m", "direction"},
@@ -124,9 +111,6 @@ NEEDED = {
     Form.TORUS: {"size_m", "tube_m", "direction"},
     Form.PLANE: {"direction"},
 }
-MODEL_KEYS = {"surfaces", "turns", "motion", "motion_axis", "low", "high"}
-
-
 SHIPPED = Path(__file__).with_name("components.toml")
 
 
@@ -136,13 +120,7 @@ def load_models(path: Path = SHIPPED) -> tuple[ComponentModel, ...]:
     Raises:
         ConfigError: the file cannot be read or violates the format; the message names the key.
     """
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}", hint="check the path of the model file") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: {error}", hint="the file is not valid TOML") from error
-    return models_from(document, where=str(path))
+    return models_from(toml_data(read_text(path, "model file"), source=str(path)), where=str(path))
 
 
 def models_from(document: Mapping[str, Any], *, where: str = "models") -> tuple[ComponentModel, ...]:
@@ -173,7 +151,7 @@ def _model(name: str, table: Mapping[str, Any], *, where: str) -> ComponentModel
         surfaces=surfaces,
         turns=_turns(table, where),
         motion=MotionKind(motion),
-        motion_axis=_unit(_vector(table, "motion_axis", (0.0, 0.0, 1.0), where), where),
+        motion_axis=_unit(_numbers(table, "motion_axis", (0.0, 0.0, 1.0), where), where),
         low=low,
         high=high,
     )
@@ -199,23 +177,23 @@ def _surface(row: Mapping[str, Any], *, where: str) -> ModelSurface:
         missing.append("size_m")
     if missing:
         raise ConfigError(f"{where}: a {form} needs {missing[0]}", hint="models are drawn as rays see them")
-    direction = _vector(row, "direction", (0.0, 0.0, 0.0), where)
+    direction = np.array(_numbers(row, "direction", (0.0, 0.0, 0.0), where))
     if "direction" in NEEDED[form]:
         direction = _unit(direction, f"{where}.direction")
-    sides = _pair(row, "sides_m", where) if "sides_m" in row else None
+    sides = _numbers(row, "sides_m", (0.0, 0.0), where) if "sides_m" in row else None
     return ModelSurface(
         name=str(row.get("name", kind)),
         type=form,
-        point_m=_vector(row, "point_m", (0.0, 0.0, 0.0), where),
+        point_m=np.array(_numbers(row, "point_m", (0.0, 0.0, 0.0), where)),
         direction=direction,
         along=_along(row, direction, where) if sides is not None else np.zeros(3),
         size_m=_number(row, "size_m", 0.0, where),
         half_angle_rad=_number(row, "half_angle_rad", 0.0, where),
         sides_m=sides,
         length_m=_number(row, "length_m", 0.0, where),
-        radii_m=_vector(row, "radii_m", (0.0, 0.0, 0.0), where),
+        radii_m=np.array(_numbers(row, "radii_m", (0.0, 0.0, 0.0), where)),
         tube_m=_number(row, "tube_m", 0.0, where),
-        between_m=_pair(row, "between_m", where) if "between_m" in row else (-math.inf, math.inf),
+        between_m=_numbers(row, "between_m", (-math.inf, math.inf), where),
         tolerance_m=_number(row, "tolerance_m", 0.002, where),
         moves=bool(row.get("moves", False)),
     )
@@ -223,7 +201,7 @@ def _surface(row: Mapping[str, Any], *, where: str) -> ModelSurface:
 
 def _along(row: Mapping[str, Any], normal: Array, where: str) -> Array:
     """Return the unit direction of a rectangle's first side, projected into the face."""
-    side = _vector(row, "along", (1.0, 0.0, 0.0), where)
+    side = np.array(_numbers(row, "along", (1.0, 0.0, 0.0), where))
     return _unit(side - normal * float(normal @ side), f"{where}.along")
 
 
@@ -242,25 +220,21 @@ def _number(table: Mapping[str, Any], key: str, default: float, where: str) -> f
     return float(value)
 
 
-def _vector(table: Mapping[str, Any], key: str, default: Sequence[float], where: str) -> Array:
-    """Return three numbers of the table as an array (3,), or the default."""
+def _numbers(table: Mapping[str, Any], key: str, default: Sequence[float], where: str) -> tuple[float, ...]:
+    """Return as many numbers of the table as the default has, or the default."""
     value = table.get(key, default)
-    if not isinstance(value, list | tuple) or len(value) != 3 or not all(isinstance(v, int | float) for v in value):
-        raise ConfigError(f"{where}.{key} is {value!r}", hint="give three numbers")
-    return np.array(value, float)
+    if (
+        not isinstance(value, list | tuple)
+        or len(value) != len(default)
+        or not all(isinstance(v, int | float) for v in value)
+    ):
+        raise ConfigError(f"{where}.{key} is {value!r}", hint=f"give {len(default)} numbers")
+    return tuple(float(v) for v in value)
 
 
-def _pair(table: Mapping[str, Any], key: str, where: str) -> tuple[float, float]:
-    """Return two numbers of the table."""
-    value = table[key]
-    if not isinstance(value, list | tuple) or len(value) != 2 or not all(isinstance(v, int | float) for v in value):
-        raise ConfigError(f"{where}.{key} is {value!r}", hint="give two numbers")
-    return float(value[0]), float(value[1])
-
-
-def _unit(vector: Array, where: str) -> Array:
+def _unit(vector: ArrayLike, where: str) -> Array:
     """Return the vector (3,) with length one."""
     length = float(np.linalg.norm(vector))
     if length < 1e-9:
         raise ConfigError(f"{where}: a direction of length zero", hint="give a vector; its length does not matter")
-    return vector / length
+    return np.asarray(vector) / length

@@ -119,9 +119,6 @@ def climb(
         low[3], high[3] = model.low - slack, model.high + slack
     low[4:], high[4:] = -solid.tolerance_m, solid.tolerance_m
     moved = q.copy()
-    score = climbed(
-        solid.rows, solid.boxes, solid.tolerance_m, solid.slide, moved,
-        np.zeros((0, q.size)) if ways is None else ways, low, high, levels,
-        view.depth_m, view.panel_m, view.sigma_m, view.packed, view.R, view.p, max(stride, 1), stride == 0,
-    )  # fmt: skip
-    return Try(candidate=candidate, q=moved, score=float(score))
+    steps = np.zeros((0, q.size)) if ways is None else ways
+    score = climbed(solid, moved, view, steps, low, high, levels, max(stride, 1), stride == 0)
+    return Try(candidate=candidate, q=moved, score=score)

@@ -9,10 +9,9 @@ object is then larger than the model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hal.arrays import Array, Indices, Mask
 from hal.jit import compiled
@@ -31,8 +30,7 @@ TRIES = 4  # most rounds of the coordinate search per step size
 HITS, BEHIND, RING, FRONT, COVERED, BETWEEN = range(6)  # indices of the `counts` of `judged`
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
+class View(NamedTuple):
     """The image data that hypotheses are compared with.
 
     Attributes:
@@ -56,8 +54,7 @@ class View:
         return float((self.p[2] if self.packed[0] > 0 else 1.0) / self.packed[1])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Solid:
+class Solid(NamedTuple):
     """A model in the form that the kernels use.
 
     Attributes:
@@ -73,131 +70,132 @@ class Solid:
     slide: Array
 
 
-@compiled
-def _placed(
-    boxes: Array, slide: Array, q: Array, R0: Array, p0: Array, sen: Array, limit: Indices, R: Array, p: Array,
-    window: Indices,
-) -> None:  # fmt: skip
-    """Write the pose of the hypothesis q into `R`, `p`, and the pixels that the solid covers into `window`.
+class Drawing(NamedTuple):
+    """A hypothesis drawn over the `window` (u0, v0, u1, v1, exclusive) of an image; arrays begin at its first pixel.
 
-    R0, p0: sensor_from_panel. R, p: sensor_from_object. The window has a margin for pixels beyond the outline.
+    Attributes:
+        depth_m, rows: rendered depth (infinite where nothing is hit) and row number, or -1.
+        hits: 1 where the image agrees.
+        lift_m: (S,) how much deeper than rendered each row was found.
+        counts: (6,) numbers of pixels that are explained (HITS), seen through (BEHIND), continuing beyond the outline
+            (RING), hidden (FRONT), covered (COVERED), and mixed with a neighbour (BETWEEN).
+    """
+
+    window: Indices
+    depth_m: Array
+    rows: Indices
+    hits: Indices
+    lift_m: Array
+    counts: Array
+
+
+@compiled
+def new_drawing(solid: Solid, view: View, stride: int) -> Drawing:
+    """Allocate a drawing of every `stride`-th pixel."""
+    H, W = view.depth_m.shape
+    n = (2 * H + stride) // stride, (2 * W + stride) // stride
+    window, lift_m, counts = np.empty(4, np.int64), np.empty(solid.rows.shape[0]), np.empty(6)
+    return Drawing(window, np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), lift_m, counts)
+
+
+@compiled
+def _place(solid: Solid, q: Array, view: View, R: Array, p: Array, window: Indices) -> None:
+    """Write the pose of the hypothesis q, sensor_from_object, into `R`, `p`, and the pixels of the solid into `window`.
+
+    The window has a margin for pixels beyond the outline, and may reach beyond the image by half its size.
     """
     c, s = np.cos(q[2]), np.sin(q[2])
     for a in range(3):
-        R[a, 0] = c * R0[a, 0] + s * R0[a, 1]
-        R[a, 1] = c * R0[a, 1] - s * R0[a, 0]
-        R[a, 2] = R0[a, 2]
-        p[a] = p0[a] + q[0] * R0[a, 0] + q[1] * R0[a, 1]
+        R[a, 0] = c * view.R[a, 0] + s * view.R[a, 1]
+        R[a, 1] = c * view.R[a, 1] - s * view.R[a, 0]
+        R[a, 2] = view.R[a, 2]
+        p[a] = view.p[a] + q[0] * view.R[a, 0] + q[1] * view.R[a, 1]
     box = np.empty((2, 3))
     for a in range(3):
         # For speed one box is used for all rows; it also holds those that do not slide.
-        box[0, a] = boxes[:, 0, a].min() + min(slide[a] * q[3], 0.0)
-        box[1, a] = boxes[:, 1, a].max() + max(slide[a] * q[3], 0.0)
-    window_of(box, np.zeros(3), R, p, sen, RING_PX + 1, limit, window)
+        box[0, a] = solid.boxes[:, 0, a].min() + min(solid.slide[a] * q[3], 0.0)
+        box[1, a] = solid.boxes[:, 1, a].max() + max(solid.slide[a] * q[3], 0.0)
+    H, W = view.depth_m.shape
+    limit = np.array([-W // 2, -H // 2, W + W // 2, H + H // 2])
+    window_of(box, np.zeros(3), R, p, view.packed, RING_PX + 1, limit, window)
 
 
 @compiled
-def _lifts(
-    m: Array, k: Indices, window: Indices, stride: int, h: int, w: int, z: Array, sigma: Array, tolerance: Array,
-    is_free: Mask, lift: Array,
-) -> None:  # fmt: skip
-    """Estimate into `lift` (S,) how much deeper each row of this component lies than in its model.
+def _estimate_lifts(drawn: Drawing, stride: int, h: int, w: int, solid: Solid, view: View, is_free: Mask) -> None:
+    """Estimate how much deeper each row of this component lies than in its model.
 
-    m, k: rendered depth and row number of the pixels of `window`; `is_free` (S,): rows whose height may differ, by up
-    to their tolerance.
+    `is_free` (S,): rows whose height may differ, by up to their tolerance.
     """
-    S = lift.shape[0]
-    weight, total = np.zeros(S), np.zeros(S)
+    tolerance, z, sigma, lift = solid.tolerance_m, view.depth_m, view.sigma_m, drawn.lift_m
+    weight, total = np.zeros(lift.shape[0]), np.zeros(lift.shape[0])
     for j in range(h):
         for i in range(w):
-            s = k[j, i]
+            s = drawn.rows[j, i]
             if s < 0 or not is_free[s]:
                 continue
-            v, u = window[1] + j * stride, window[0] + i * stride
+            v, u = drawn.window[1] + j * stride, drawn.window[0] + i * stride
             if v < 0 or u < 0 or v >= z.shape[0] or u >= z.shape[1]:
                 continue
-            r = z[v, u] - m[j, i]
+            r = z[v, u] - drawn.depth_m[j, i]
             if abs(r) < tolerance[s] + 3.0 * sigma[v, u]:
                 g = 1.0 / (sigma[v, u] * sigma[v, u])
                 weight[s] += g
                 total[s] += g * r
-    for s in range(S):
+    for s in range(lift.shape[0]):
         prior = 4.0 / (tolerance[s] * tolerance[s] + 1e-12)
-        lift[s] = min(max(total[s] / (weight[s] + prior), -tolerance[s]), tolerance[s])
+        lift[s] = min(max(total[s] / (weight[s] + prior), -tolerance[s]), tolerance[s]) if is_free[s] else 0.0
 
 
 @compiled
-def judged(
-    rows: Array, boxes: Array, tolerance: Array, slide: Array, q: Array, z: Array, panel: Array, sigma: Array,
-    sen: Array, R0: Array, p0: Array, stride: int, rim: bool, m: Array, k: Indices, lift: Array, hits: Indices,
-    counts: Array,
-) -> float:  # fmt: skip
+def judged(solid: Solid, q: Array, view: View, stride: int, rim: bool, drawn: Drawing) -> float:
     """Return the log-likelihood gain of the hypothesis q = (x, y, yaw, state, size change of each row) over the panel.
 
     Args:
-        z, panel, sigma: images of `View`.
         stride: every `stride`-th pixel is used.
         rim: whether to count pixels beyond the outline whose depth continues smoothly; only with `stride` 1.
-        m, k, hits: scratch: rendered depth, row, and whether the pixel is explained, packed as by `render`.
-        lift: (S,) filled with how much deeper than rendered each row was found.
-        counts: (6,) filled with the number of pixels that are explained (HITS), seen through (BEHIND), continuing
-            beyond the outline (RING), hidden (FRONT), covered (COVERED), and mixed with a neighbour (BETWEEN).
+        drawn: filled; a drawing for that stride.
     """
-    H, W = z.shape
-    S = rows.shape[0]
-    R, p, window = np.empty((3, 3)), np.empty(3), np.empty(4, np.int64)
-    limit = np.array([-W // 2, -H // 2, W + W // 2, H + H // 2])
-    _placed(boxes, slide, q, R0, p0, sen, limit, R, p, window)
+    window, m, k, counts = drawn.window, drawn.depth_m, drawn.rows, drawn.counts
+    z, sigma = view.depth_m, view.sigma_m
+    R, p = np.empty((3, 3)), np.empty(3)
+    _place(solid, q, view, R, p, window)
     h, w = (window[3] - window[1] + stride - 1) // stride, (window[2] - window[0] + stride - 1) // stride
     counts[:] = 0.0
     if h <= 0 or w <= 0:
         return -1e3
-    shift = slide * q[3]
-    render(rows, boxes, q[4:], shift, R, p, sen, window, stride, m, k)
-    slides_up = abs(slide[2]) > 0.5
-    is_free = np.empty(S, np.bool_)
-    for s in range(S):
-        is_free[s] = tolerance[s] > 0.0 and not (slides_up and rows[s, MOVES] > 0.0)
-    _lifts(m, k, window, stride, h, w, z, sigma, tolerance, is_free, lift)
-    score = _priors(q, tolerance, is_free, lift)
+    render(solid.rows, solid.boxes, q[4:], solid.slide * q[3], R, p, view.packed, window, stride, m, k)
+    slides_up = abs(solid.slide[2]) > 0.5
+    is_free = (solid.tolerance_m > 0.0) & ~(slides_up & (solid.rows[:, MOVES] > 0.0))
+    _estimate_lifts(drawn, stride, h, w, solid, view, is_free)
+    # The prior of deviations from the model's heights and sizes: a tolerance is two standard deviations.
+    t = 0.5 * solid.tolerance_m + 1e-9
+    score = -0.5 * np.sum((drawn.lift_m / t) ** 2 + (q[4:] / t) ** 2)
     for j in range(h):
         for i in range(w):
             s = k[j, i]
-            hits[j, i] = 0
+            drawn.hits[j, i] = 0
             if s < 0:
                 continue
             counts[COVERED] += 1.0
             v, u = window[1] + j * stride, window[0] + i * stride
-            if v < 0 or u < 0 or v >= H or u >= W or not np.isfinite(z[v, u]):
+            if v < 0 or u < 0 or v >= z.shape[0] or u >= z.shape[1] or not np.isfinite(z[v, u]):
                 score += HIDDEN
                 continue
             least = sigma[v, u] * sigma[v, u] + SLACK_M * SLACK_M
             slope = SLOPE_SHARE * min(_slope(m, k, j, i, h, w) / stride, STEEPEST_M)
             wide = least + slope * slope
-            r, b = z[v, u] - m[j, i] - lift[s], z[v, u] - panel[v, u]
+            r, b = z[v, u] - m[j, i] - drawn.lift_m[s], z[v, u] - view.panel_m[v, u]
             gain = HIT - 0.5 * r * r / wide - 0.5 * np.log(wide / least)
             floor, kind = (HIDDEN, FRONT) if r < 0.0 else (SEEN_THROUGH, BEHIND)
             if gain > 0.0:
-                hits[j, i], kind = 1, HITS
-            elif r > 0.0 and z[v, u] < _deepest_beside(m, k, j, i, h, w, panel[v, u]) - 3.0 * sigma[v, u]:
+                drawn.hits[j, i], kind = 1, HITS
+            elif r > 0.0 and z[v, u] < _deepest_beside(m, k, j, i, h, w, view.panel_m[v, u]) - 3.0 * sigma[v, u]:
                 floor, kind = MIXED, BETWEEN
             counts[kind] += 1.0
             score += max(gain, floor) - max(HIT - 0.5 * b * b / least, 0.0)
     if rim:
-        score += GOES_ON * _going_on(m, k, window, h, w, z, panel, sigma, hits, counts)
+        score += GOES_ON * _going_on(drawn, h, w, view)
     return score * stride * stride
-
-
-@compiled
-def _priors(q: Array, tolerance: Array, is_free: Mask, lift: Array) -> float:
-    """Return the log prior of deviations from the model's heights and sizes; a tolerance is two standard deviations."""
-    out = 0.0
-    for s in range(tolerance.shape[0]):
-        if not is_free[s]:
-            lift[s] = 0.0
-        t = 0.5 * tolerance[s] + 1e-9
-        out -= 0.5 * ((lift[s] / t) ** 2 + (q[4 + s] / t) ** 2)
-    return out
 
 
 @compiled
@@ -232,15 +230,13 @@ def _deepest_beside(m: Array, k: Indices, j: int, i: int, h: int, w: int, panel:
 
 
 @compiled
-def _going_on(
-    m: Array, k: Indices, window: Indices, h: int, w: int, z: Array, panel: Array, sigma: Array, hits: Indices,
-    counts: Array,
-) -> float:  # fmt: skip
+def _going_on(drawn: Drawing, h: int, w: int, view: View) -> float:
     """Count pixels beyond the outline, or in front of the model, whose depth continues smoothly from explained pixels.
 
     An occluder is separated from the model by a depth jump. Depth in front of the model without a jump therefore means
     that the object is larger than the model.
     """
+    window, m, k, hits, z = drawn.window, drawn.depth_m, drawn.rows, drawn.hits, view.depth_m
     for j in range(h):
         for i in range(w):
             if k[j, i] >= 0 and hits[j, i] != 0:
@@ -248,8 +244,8 @@ def _going_on(
             v, u = window[1] + j, window[0] + i
             if v < 0 or u < 0 or v >= z.shape[0] or u >= z.shape[1]:
                 continue
-            depth, s = z[v, u], sigma[v, u]
-            if not depth < panel[v, u] - 4.0 * s or (k[j, i] >= 0 and depth > m[j, i] - 2.0 * s):
+            depth, s = z[v, u], view.sigma_m[v, u]
+            if not depth < view.panel_m[v, u] - 4.0 * s or (k[j, i] >= 0 and depth > m[j, i] - 2.0 * s):
                 continue
             for dj, di in ((RING_PX, 0), (-RING_PX, 0), (0, RING_PX), (0, -RING_PX)):
                 a, b = j + dj, i + di
@@ -259,15 +255,14 @@ def _going_on(
                 if 0 <= a + dj < h and 0 <= b + di < w and k[a + dj, b + di] == k[a, b]:
                     step = abs(m[a + dj, b + di] - m[a, b])
                 if abs(depth - z[window[1] + a, window[0] + b]) < 3.0 * s + SLACK_M + min(step, STEEPEST_M):
-                    counts[RING] += 1.0
+                    drawn.counts[RING] += 1.0
                     break
-    return float(counts[RING])
+    return float(drawn.counts[RING])
 
 
 @compiled
 def climbed(
-    rows: Array, boxes: Array, tolerance: Array, slide: Array, q: Array, ways: Array, low: Array, high: Array,
-    levels: int, z: Array, panel: Array, sigma: Array, sen: Array, R0: Array, p0: Array, stride: int, rim: bool,
+    solid: Solid, q: Array, view: View, ways: Array, low: Array, high: Array, levels: int, stride: int, rim: bool,
 ) -> float:  # fmt: skip
     """Move `q` to a local maximum of the gain by coordinate search along `ways`; returns its gain.
 
@@ -276,11 +271,8 @@ def climbed(
         low, high: (4 + S,) bounds of the hypothesis.
         levels: number of step sizes, each half the previous one; 0 only computes the gain.
     """
-    H, W = z.shape
-    n = (2 * H + stride) // stride, (2 * W + stride) // stride
-    m, k, hits = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
-    lift, counts = np.empty(rows.shape[0]), np.empty(6)
-    best = judged(rows, boxes, tolerance, slide, q, z, panel, sigma, sen, R0, p0, stride, rim, m, k, lift, hits, counts)
+    drawn = new_drawing(solid, view, stride)
+    best = judged(solid, q, view, stride, rim, drawn)
     size = 1.0
     for _ in range(levels):
         for _ in range(TRIES):
@@ -288,26 +280,7 @@ def climbed(
             for c in range(ways.shape[0]):
                 for sign in (size, -size):
                     moved = np.minimum(np.maximum(q + sign * ways[c], low), high)
-                    now = judged(
-                        rows,
-                        boxes,
-                        tolerance,
-                        slide,
-                        moved,
-                        z,
-                        panel,
-                        sigma,
-                        sen,
-                        R0,
-                        p0,
-                        stride,
-                        rim,
-                        m,
-                        k,
-                        lift,
-                        hits,
-                        counts,
-                    )
+                    now = judged(solid, moved, view, stride, rim, drawn)
                     if now > best + 1e-9:
                         best = now
                         q[:] = moved
@@ -318,31 +291,17 @@ def climbed(
     return best
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Explained:
-    """The pixels of a hypothesis: (6,) `counts` as in `judged`, (H, W) row rendered or -1, and whether each agrees."""
+def explained(solid: Solid, q: Array, view: View) -> tuple[Array, Indices, Mask]:
+    """Return the pixels that the hypothesis q = (x, y, yaw, state, size change of each row) covers and explains.
 
-    counts: Array
-    rows: NDArray[np.int64]
-    pixels: NDArray[np.bool_]
-
-
-def explained(solid: Solid, q: Array, view: View) -> Explained:
-    """Return the pixels that the hypothesis q = (x, y, yaw, state, size change of each row) covers and explains."""
+    Returns `Drawing.counts`, and for the image the row rendered (H, W) or -1, and whether each pixel agrees (H, W).
+    """
     H, W = view.depth_m.shape
-    n = 2 * H + 1, 2 * W + 1
-    m, k, hits = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
-    lift, counts = np.empty(len(solid.rows)), np.empty(6)
-    judged(
-        solid.rows, solid.boxes, solid.tolerance_m, solid.slide, q, view.depth_m, view.panel_m, view.sigma_m,
-        view.packed, view.R, view.p, 1, True, m, k, lift, hits, counts,
-    )  # fmt: skip
-    R, p, window = np.empty((3, 3)), np.empty(3), np.empty(4, np.int64)
-    limit = np.array([-W // 2, -H // 2, W + W // 2, H + H // 2])
-    _placed(solid.boxes, solid.slide, q, view.R, view.p, view.packed, limit, R, p, window)
-    u0, v0, u1, v1 = np.clip(window, 0, [W, H, W, H])
-    part = slice(v0 - window[1], v1 - window[1]), slice(u0 - window[0], u1 - window[0])
+    drawn = new_drawing(solid, view, 1)
+    judged(solid, q, view, 1, True, drawn)
+    u0, v0, u1, v1 = np.clip(drawn.window, 0, [W, H, W, H])
+    part = slice(v0 - drawn.window[1], v1 - drawn.window[1]), slice(u0 - drawn.window[0], u1 - drawn.window[0])
     rows, pixels = np.full((H, W), -1, np.int64), np.zeros((H, W), bool)
-    rows[v0:v1, u0:u1] = k[part]
-    pixels[v0:v1, u0:u1] = hits[part] > 0
-    return Explained(counts=counts, rows=rows, pixels=pixels)
+    rows[v0:v1, u0:u1] = drawn.rows[part]
+    pixels[v0:v1, u0:u1] = drawn.hits[part] > 0
+    return drawn.counts, rows, pixels

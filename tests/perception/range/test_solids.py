@@ -165,7 +165,7 @@ def test_a_climb_finds_the_pose_that_was_drawn(name, pose):
     fine = refined(coarse, view)
     assert np.linalg.norm(fine.q[:2] - pose[:2]) < 0.0007
     assert abs(fine.q[2] - pose[2]) < 0.02
-    counts = explained(candidate.solid, fine.q, view).counts
+    counts, _, _ = explained(candidate.solid, fine.q, view)
     assert counts[HITS] > 0.93 * counts[COVERED] and counts[RING] < 0.1 * counts[COVERED]
 
 
@@ -179,7 +179,7 @@ def test_hidden_pixels_cost_little_and_seen_through_ones_much():
     behind = panel_view(half)
     hidden = climb(candidate, q, behind)
     assert 0.3 * whole < hidden.score < 0.6 * whole
-    counts = explained(candidate.solid, q, behind).counts
+    counts, _, _ = explained(candidate.solid, q, behind)
     assert counts[FRONT] > 0.4 * counts[COVERED] and counts[BEHIND] < 0.02 * counts[COVERED]
     half[:, :60] = 0.8  # the sensor sees beyond the model
     assert climb(candidate, q, panel_view(half)).score < 0.1 * whole
@@ -195,8 +195,8 @@ def test_what_goes_on_beyond_the_outline_contradicts():
     pose = np.zeros(4)
     right, wrong = drawn(small, pose), drawn(large, pose)
     candidate = candidate_of(small)
-    assert explained(candidate.solid, q, right).counts[RING] < 5
-    assert explained(candidate.solid, q, wrong).counts[RING] > 30
+    assert explained(candidate.solid, q, right)[0][RING] < 5
+    assert explained(candidate.solid, q, wrong)[0][RING] > 30
     assert climb(candidate, q, wrong).score < climb(candidate, q, right).score - 60.0
 
 

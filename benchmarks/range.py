@@ -28,7 +28,7 @@ from benchmarks.range_soft import SCENES, VIEWS, soft_scene
 from hal.arrays import Array
 from perception.range import Surface, analyse
 from perception.range.primitives import Cone, Cylinder, Ellipsoid, Plane, Sphere
-from perception.range.recordings import load_recording, sensor_from_meta
+from perception.range.recordings import Reading, load_recording, sensor_from_meta
 from perception.range.warm import warm_up
 from perception.range.window import Window
 
@@ -60,7 +60,7 @@ def predict(cases: Path, out: Path, *, timed: bool, codes: bool) -> None:
     """Write one prediction per case into `out`; for an unreadable case an empty one and a line on stderr."""
     out.mkdir(parents=True, exist_ok=True)
     for path in sorted(cases.glob("*.npz")):
-        depth, sensor = load_recording(path, codes=codes)
+        depth, sensor = load_recording(path, reading=Reading(codes=codes))
         try:
             scene = analyse(depth, sensor)
             labels, surfaces = scene.labels, scene.surfaces

@@ -78,25 +78,20 @@ def axis_feature(surface: Surface) -> RangeFeature:
     if isinstance(shape, Cylinder):
         # The covariance of the shifts refers to the fit's own reference point; the lever of a tilt between that point and
         # `point_m` is neglected.
-        return RangeFeature(
-            kind=FeatureKind.LINE,
-            point_m=shape.point_m,
-            point_covariance=frame.T @ C[:2, :2] @ frame,
-            direction=shape.axis,
-            direction_covariance=frame.T @ C[2:4, 2:4] @ frame,
-            labels=(surface.label,),
-        )
-    if isinstance(shape, Cone):
+        point, point_covariance, tilts = shape.point_m, frame.T @ C[:2, :2] @ frame, C[2:4, 2:4]
+    elif isinstance(shape, Cone):
         across = np.eye(3) - np.outer(shape.axis, shape.axis)
-        return RangeFeature(
-            kind=FeatureKind.LINE,
-            point_m=shape.apex_m,
-            point_covariance=across @ C[:3, :3] @ across,
-            direction=shape.axis,
-            direction_covariance=frame.T @ C[3:5, 3:5] @ frame,
-            labels=(surface.label,),
-        )
-    raise TypeError(f"surface {surface.label} is a {surface.type}: it has no axis")
+        point, point_covariance, tilts = shape.apex_m, across @ C[:3, :3] @ across, C[3:5, 3:5]
+    else:
+        raise TypeError(f"surface {surface.label} is a {surface.type}: it has no axis")
+    return RangeFeature(
+        kind=FeatureKind.LINE,
+        point_m=point,
+        point_covariance=point_covariance,
+        direction=shape.axis,
+        direction_covariance=frame.T @ tilts @ frame,
+        labels=(surface.label,),
+    )
 
 
 def point_feature(surface: Surface) -> RangeFeature:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from hal.arrays import Array
+from hal.arrays import Array, Indices
 from hal.errors import NotFound
 from perception.range.sensor import RangeSensorModel
 
@@ -46,7 +45,7 @@ def image_from_points(points_base_m: Array, base_from_view: RigidTransform, sens
     return depth
 
 
-def _means(index: NDArray[np.int64], depth_m: Array, value: Array, offset_px: Array, shape: tuple[int, int]) -> Array:
+def _means(index: Indices, depth_m: Array, value: Array, offset_px: Array, shape: tuple[int, int]) -> Array:
     """Return per pixel the mean value of its points on the nearest surface and their mean offset, (3, H, W).
 
     The offset (rows, columns) is from the pixel's centre. `index`: flat pixel index of each point.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from hal.arrays import Array
+from hal.arrays import Array, Mask
 from hal.errors import InvalidRequest, NotFound
 from perception.range.analysis import checked_depth
 from perception.range.features import RangeFeature, plane_feature
@@ -25,6 +25,7 @@ HYPOTHESES = 24  # seeds whose planes are tried, per direction of the normal
 INLIER_SIGMAS = 3.0
 LEAST_BLOCKS = 12  # least number of blocks near the expected plane, and on the plane found
 LEAST_SHARE = 0.05  # of the valid pixels: a plane with fewer is not the panel
+SCATTERED = 0.5  # least length of the mean of the normals; if they scatter more, it has no direction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,7 +42,7 @@ class PlaneFit:
 
     surface: Surface
     feature: RangeFeature
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     sight_share: float
     noise: NoiseModel
 
@@ -78,21 +79,17 @@ def fit_plane_near(
     middle = float(np.nanmedian(depth))
     grid = build_grid(depth, sensor, law, block_size((depth.shape[0], depth.shape[1]), law, sensor, middle))
     points, sigma, normals = _block_points(grid)
-    near = _near_expectation(
-        points, sigma, expected, through, sigma_offset_m=sigma_offset_m, sigma_angle_rad=sigma_angle_rad
-    )
-    if near.sum() < LEAST_BLOCKS:
-        raise _nothing_near(sigma_offset_m, sigma_angle_rad)
-    plane = _most_supported(
-        points[near],
-        sigma[near],
-        normals[near],
-        expected,
-        sigma_angle_rad=sigma_angle_rad,
-        normal_sigma_rad=grid.normal_sigma_rad,
-    )
+    away = (points - through) @ expected
+    lateral = np.linalg.norm(points - through - away[:, None] * expected, axis=1)
+    gate = 3.0 * np.sqrt(sigma_offset_m**2 + (lateral * np.tan(min(sigma_angle_rad, 1.0))) ** 2 + sigma**2)
+    near = np.abs(away) <= gate
+    turn_rad = 3.0 * float(np.hypot(sigma_angle_rad, grid.normal_sigma_rad)) + 0.05
+    plane = _most_supported(points[near], sigma[near], normals[near], expected, sigma_angle_rad, turn_rad)
     if plane is None:
-        raise _nothing_near(sigma_offset_m, sigma_angle_rad)
+        raise NotFound(
+            "no plane lies near the expected one",
+            hint=f"widen the expectation ({sigma_offset_m:.3f} m, {sigma_angle_rad:.2f} rad) or rescan from elsewhere",
+        )
     return _fitted(depth, sensor, law, plane, swept)
 
 
@@ -122,44 +119,30 @@ def _block_points(grid: Grid) -> tuple[Array, Array, Array]:
     return points[ok], grid.sigma.ravel()[ok], grid.normal.reshape(-1, 3)[ok]
 
 
-def _near_expectation(
-    points: Array, sigma: Array, expected: Array, through: Array, *, sigma_offset_m: float, sigma_angle_rad: float
-) -> NDArray[np.bool_]:
-    """Return which points (N, 3) the expected plane may contain, within three standard deviations."""
-    away = (points - through) @ expected
-    lateral = np.linalg.norm(points - through - away[:, None] * expected, axis=1)
-    gate = 3.0 * np.sqrt(sigma_offset_m**2 + (lateral * np.tan(min(sigma_angle_rad, 1.0))) ** 2 + sigma**2)
-    return np.asarray(np.abs(away) <= gate)
-
-
 def _most_supported(
-    points: Array, sigma: Array, normals: Array, expected: Array, *, sigma_angle_rad: float, normal_sigma_rad: float
+    points: Array, sigma: Array, normals: Array, expected: Array, sigma_angle_rad: float, turn_rad: float
 ) -> Array | None:
-    """Return normal and offset (4,) of the plane hypothesis with the most inlier blocks, refitted; None if all fail."""
-    turn = np.arccos(np.clip(normals @ expected, -1.0, 1.0))
-    facing = np.flatnonzero(turn <= 3.0 * np.hypot(sigma_angle_rad, normal_sigma_rad) + 0.05)
+    """Return normal and offset (4,) of the plane hypothesis with the most inlier blocks, refitted; None if all fail.
+
+    `turn_rad`: largest angle between the normals of a block and of the expected plane.
+    """
+    facing = np.flatnonzero(np.arccos(np.clip(normals @ expected, -1.0, 1.0)) <= turn_rad)
     if facing.size < LEAST_BLOCKS:
         return None
     seeds = facing[np.linspace(0, facing.size - 1, min(HYPOTHESES, facing.size)).astype(int)]
     # The normal of a single block is too noisy to be extrapolated across the panel, so a seed only gives the offset.
+    middle = np.median(normals[facing], axis=0)
+    length = float(np.linalg.norm(middle))
     plane, support = None, LEAST_BLOCKS - 1
-    for n in (expected, *(_mean_normal(normals[facing], expected),)):
+    for n in (expected, middle / length) if length > SCATTERED else (expected,):
         for seed in seeds:
-            candidate = np.array([*n, n @ points[seed]])
-            candidate, count = _refitted(points, sigma, candidate, sigma_angle_rad)
+            candidate, count = _refitted(points, sigma, np.array([*n, n @ points[seed]]), sigma_angle_rad)
             if count > support:
                 plane, support = candidate, count
     if plane is None:
         return None
     limit = 3.0 * sigma_angle_rad + 0.02
     return plane if np.arccos(np.clip(plane[:3] @ expected, -1.0, 1.0)) <= limit else None
-
-
-def _mean_normal(normals: Array, expected: Array) -> Array:
-    """Return the direction of the median of the normals (N, 3), or the expected one if they scatter too much."""
-    middle = np.median(normals, axis=0)
-    length = float(np.linalg.norm(middle))
-    return np.asarray(middle / length) if length > 0.5 else expected
 
 
 def _refitted(points: Array, sigma: Array, plane: Array, sigma_angle_rad: float) -> tuple[Array, int]:
@@ -216,11 +199,3 @@ def _fitted(
             hint="point the scanner at the panel, or widen the expectation",
         )
     return PlaneFit(surface=surface, feature=plane_feature(surface), inliers=inliers, sight_share=share, noise=noise)
-
-
-def _nothing_near(sigma_offset_m: float, sigma_angle_rad: float) -> NotFound:
-    """Return the error for an image without a plane near the expected one."""
-    return NotFound(
-        "no plane lies near the expected one",
-        hint=f"widen the expectation ({sigma_offset_m:.3f} m, {sigma_angle_rad:.2f} rad) or rescan from elsewhere",
-    )

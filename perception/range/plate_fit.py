@@ -1,6 +1,6 @@
 """Least-squares fit of a plane to the pixels of a plate that carries other things, with a covariance from its residuals.
 
-Labels, frames and cables stand out by less than the noise of one pixel, so no pixel shows them, but the mean of a tile does.
+Indices, frames and cables stand out by less than the noise of one pixel, so no pixel shows them, but the mean of a tile does.
 Tiles that stand out are left out. What is left of their errors, and errors common to one line of a scanner, make the
 residuals of neighbours alike; the covariance therefore sums them by clusters:
 
@@ -17,10 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from hal.arrays import Array
+from hal.arrays import Array, Indices, Mask
 from perception.range.sweep import SweptErrors
 
 TILES_ACROSS, LEAST_TILE_PX = 21, 6  # 3 cm of a panel in an overview
@@ -31,9 +30,6 @@ LEAST_KEPT_SHARE = 0.5  # of a tile's measured pixels; with fewer on the plane i
 LEAST_TILES = 12
 OUTLIER_PASSES, LEAST_COMMON = 5.0, 200  # sigmas of a pixel; pixels
 MEDIAN_TO_SIGMA = 1.4826
-
-Mask = NDArray[np.bool_]
-Labels = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,9 +57,9 @@ class _Pixels:
     points_m: Array
     apart_m: Array
     sigma_m: Array
-    tile: Labels
-    row: Labels
-    cluster: Labels
+    tile: Indices
+    row: Indices
+    cluster: Indices
     across: int  # tiles of a row
 
     def weights(self, normal: Array) -> Array:
@@ -183,7 +179,7 @@ def _between_passes(points_m: Array, apart_m: Array, g: Array, w: Array, n: Arra
     return np.asarray(np.linalg.solve((gk * wk[:, None]).T @ gk, gk.T @ (wk * along_m[known])))
 
 
-def _summed(scores: Array, cluster: Labels) -> Array:
+def _summed(scores: Array, cluster: Indices) -> Array:
     """Return the sum of the clusters' squared scores, corrected for the three fitted parameters."""
     _, index = np.unique(cluster, return_inverse=True)
     sums = np.stack([np.bincount(index, weights=column) for column in scores.T], axis=1)

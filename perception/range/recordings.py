@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,22 +102,21 @@ class Reading:
 AS_FILED = Reading()
 
 
-def load_recording(
-    path: Path, *, reading: Reading = AS_FILED, sensor: RangeSensorModel | None = None, codes: bool = False
-) -> tuple[Array, RangeSensorModel]:
+def load_recording(path: Path, *, reading: Reading = AS_FILED) -> tuple[Array, RangeSensorModel]:
     """Return depth (H, W) in metres, with NaN for missing readings, and the sensor model of one recording.
 
-    Args:
-        reading: what the file does not say.
-        sensor: sensor model to use instead of that of the file or of `reading`.
-        codes: as `Reading.codes`.
+    `reading`: what the file does not say.
 
     Raises:
         InvalidRequest: the file cannot be read as a recording; the message says why.
     """
-    load = _loader(path)
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InvalidRequest(f"{path} is a folder", hint="`panelwright batch range FOLDER` analyses all of one")
+    if suffix not in SUFFIXES:
+        raise InvalidRequest(f"{path.name} is of no known kind", hint=f"recordings end in {', '.join(SUFFIXES)}")
     try:
-        depth, filed = load(path, reading, codes or reading.codes)
+        depth, filed = _load_npz(path, reading) if suffix == ".npz" else (_decoded(_image(path), reading), None)
     except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         missing = isinstance(error, OSError)
@@ -127,7 +125,7 @@ def load_recording(
     if depth.ndim != 2:
         raise InvalidRequest(f"{path.name} holds shape {depth.shape}", hint="one (H, W) depth image a file")
     shape = (depth.shape[0], depth.shape[1])
-    return depth, sensor or reading.sensor(shape) or filed or assumed_sensor(shape)
+    return depth, reading.sensor(shape) or filed or assumed_sensor(shape)
 
 
 def assumptions(path: Path, reading: Reading) -> tuple[str, ...]:
@@ -155,41 +153,17 @@ def assumed_sensor(shape: tuple[int, int]) -> PinholeSensor:
     return PinholeSensor(width_px=w, height_px=h, fx_px=focal, fy_px=focal, cx_px=(w - 1) / 2, cy_px=(h - 1) / 2)
 
 
-Loaded = tuple[Array, RangeSensorModel | None]
-
-
-def _loader(path: Path) -> Callable[[Path, Reading, bool], Loaded]:
-    """Return the function that loads a file with the suffix of `path`.
-
-    Raises:
-        InvalidRequest: the path is a folder, or the suffix is unknown.
-    """
-    suffix = path.suffix.lower()
-    if path.is_dir():
-        raise InvalidRequest(f"{path} is a folder", hint="`panelwright batch range FOLDER` analyses all of one")
-    if suffix == ".npz":
-        return _load_npz
-    if suffix == ".npy":
-        return _load_npy
-    if suffix in SUFFIXES:
-        return _load_picture
-    raise InvalidRequest(f"{path.name} is of no known kind", hint=f"recordings end in {', '.join(SUFFIXES)}")
-
-
-def _load_picture(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa: ARG001 - a picture holds one image
-    """Load a PNG or TIFF file; it has no sensor."""
+def _image(path: Path) -> NDArray[Any]:
+    """Return the image of an npy, PNG or TIFF file."""
+    if path.suffix.lower() == ".npy":
+        with path.open("rb") as file:
+            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
     raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if raw is None:
         raise ValueError("no picture, or not all of it is there")
     if raw.ndim != 2:
         raise ValueError(f"a picture of {raw.shape[2]} channels, and depth has one")
-    return _decoded(raw, reading), None
-
-
-def _load_npy(path: Path, reading: Reading, codes: bool) -> Loaded:  # noqa: ARG001 - an array holds one image
-    """Load an npy file; it has no sensor."""
-    with path.open("rb") as file:
-        return _decoded(np.lib.format.read_array(file, allow_pickle=False), reading), None
+    return np.asarray(raw)
 
 
 def _decoded(raw: NDArray[Any], reading: Reading) -> Array:
@@ -205,7 +179,7 @@ def _decoded(raw: NDArray[Any], reading: Reading) -> Array:
     return decode_scaled(raw, reading.scale_m or DEFAULT_CODE_M)
 
 
-def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
+def _load_npz(path: Path, reading: Reading) -> tuple[Array, RangeSensorModel | None]:
     """Load an npz file, with its sensor if it holds one."""
     if path.stat().st_size and not zipfile.is_zipfile(path):
         raise ValueError("it is no zip archive, or not all of it is there")
@@ -218,7 +192,7 @@ def _load_npz(path: Path, reading: Reading, codes: bool) -> Loaded:
             return _decoded(data["depth"], reading), None
         meta = json.loads(str(data["meta"])) if "meta" in data.files else _meta_of_intrinsics(data)
         unit = UNITS_M[meta.get("unit", "mm")]
-        depth = _depth(data, meta, unit, reading, codes)
+        depth = _depth(data, meta, unit, reading)
     filed = sensor_from_meta(meta["sensor"], unit) if "sensor" in meta else None
     return depth, filed
 
@@ -228,9 +202,9 @@ def _sensor_of_reading(data: Any) -> RangeSensorModel | None:
     return sensor_from_meta(json.loads(str(data["meta"]))["sensor"], 1.0) if "meta" in data.files else None
 
 
-def _depth(data: Any, meta: dict[str, Any], unit: float, reading: Reading, codes: bool) -> Array:
+def _depth(data: Any, meta: dict[str, Any], unit: float, reading: Reading) -> Array:
     """Return the depth in metres of an npz file with metadata, from `depth` or from the 8-bit codes."""
-    if "depth" in data.files and not codes:
+    if "depth" in data.files and not reading.codes:
         raw = data["depth"]
         scale = reading.scale_m or unit
         return np.asarray(raw, float) * scale if raw.dtype.kind == "f" else decode_scaled(raw, scale)

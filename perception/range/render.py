@@ -9,9 +9,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Image
 from hal.geometry import to_json
 from perception.range.analysis import RangeScene
 from perception.range.matching.match import Match
@@ -77,7 +76,7 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, bool) else float(value)
 
 
-def colours(count: int) -> NDArray[np.uint8]:
+def colours(count: int) -> Image:
     """Return RGB colours (count + 1, 3), black for 0; the hues of successive numbers differ by the golden ratio."""
     hue = (np.arange(count + 1) * 0.61803398875) % 1.0 * 179
     value = np.where(np.arange(count + 1) % 2, 230, 180)
@@ -87,7 +86,7 @@ def colours(count: int) -> NDArray[np.uint8]:
     return np.asarray(rgb, np.uint8)
 
 
-def picture(scene: RangeScene) -> NDArray[np.uint8]:
+def picture(scene: RangeScene) -> Image:
     """Return an RGB image (sH, sW, 3) with one colour per surface and its number and type; s enlarges small images."""
     labels = scene.labels
     scale = max(1, PICTURE_PX // max(labels.shape))
@@ -102,7 +101,7 @@ def picture(scene: RangeScene) -> NDArray[np.uint8]:
     return image
 
 
-def _write(image: NDArray[np.uint8], surface: Surface, u_px: int, v_px: int, *, room_px: float) -> None:
+def _write(image: Image, surface: Surface, u_px: int, v_px: int, *, room_px: float) -> None:
     """Write number and type of a surface around (u, v), in white letters with a dark rim.
 
     `room_px`: width of the surface there; the type is shortened if it does not fit.

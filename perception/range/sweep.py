@@ -31,14 +31,16 @@ OUTLIER = 5.0  # median deviations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ScannerTrack:
-    """Poses of the scanner during a sweep.
+class SweepPass:
+    """The scans of one motion over all lines, and the poses of the scanner during it.
 
     Attributes:
+        scans: with the stamps of the scanner's driver.
         times_s: increasing times on the cell's clock.
         base_from_scanner: the pose at each of them.
     """
 
+    scans: Sequence[Stamped[RangeImage]]
     times_s: Sequence[float]
     base_from_scanner: Sequence[RigidTransform]
 
@@ -48,7 +50,7 @@ class ScannerTrack:
         Between two known poses the translation is interpolated linearly, and the rotation about a fixed axis.
 
         Raises:
-            StaleReading: a time lies outside the track or in a gap of it.
+            StaleReading: a time lies outside the known poses or in a gap of them.
         """
         known_s = np.asarray(self.times_s, np.float64)
         if len(known_s) < 2 or times_s.min() < known_s[0] or times_s.max() > known_s[-1]:
@@ -63,40 +65,20 @@ class ScannerTrack:
         turns = Slerp(known_s, Rotation.concatenate([pose.rotation for pose in self.base_from_scanner]))
         return np.asarray(turns(times_s).apply(in_scanner_m) + shift_m)
 
-    def covers(self, start_s: float, end_s: float) -> bool:
-        """Return whether poses are known from `start_s` or before until `end_s` or after."""
-        return bool(len(self.times_s)) and self.times_s[0] <= start_s and end_s <= self.times_s[-1]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SweepPass:
-    """The scans of one motion over all lines, and the poses of the scanner during it."""
-
-    scans: Sequence[Stamped[RangeImage]]
-    track: ScannerTrack
-
-    @classmethod
-    def recorded(
-        cls,
-        scans: Sequence[Stamped[RangeImage]],
-        *,
-        times_s: Sequence[float],
-        base_from_scanner: Sequence[RigidTransform],
-    ) -> SweepPass:
-        """Return the pass of these scans and of the scanner's poses at increasing times."""
-        return cls(scans=scans, track=ScannerTrack(times_s=times_s, base_from_scanner=base_from_scanner))
-
     def covered(self, c: RangeScannerCapabilities, delay_s: float = 0.0) -> list[Stamped[RangeImage]]:
         """Return the scans with a known pose for every beam, with stamps that are not late any more."""
+        if not self.times_s:
+            return []
         moved = [replace(scan, host_time_s=scan.host_time_s - delay_s) for scan in self.scans]
-        return [s for s in moved if self.track.covers(float(beam_times_s(s.host_time_s, c)[0]), s.host_time_s)]
+        first_s, last_s = self.times_s[0], self.times_s[-1]
+        return [s for s in moved if first_s <= beam_times_s(s.host_time_s, c)[0] and s.host_time_s <= last_s]
 
     def points(self, c: RangeScannerCapabilities, delay_s: float) -> Array:
         """Return the points (n, 3) of all covered scans in the base frame, metres."""
         beams = [_beams(scan, c) for scan in self.covered(c, delay_s)]
         if not sum(len(times_s) for _, times_s in beams):
             return np.empty((0, 3))
-        return self.track.in_base(np.concatenate([b[0] for b in beams]), np.concatenate([b[1] for b in beams]))
+        return self.in_base(np.concatenate([b[0] for b in beams]), np.concatenate([b[1] for b in beams]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -261,17 +243,6 @@ def beam_times_s(end_s: float, c: RangeScannerCapabilities) -> Array:
     """
     before_s = (c.width - 1 - np.arange(c.width)) * abs(c.step_angle_rad) / (math.tau * c.rate_hz)
     return np.asarray(end_s - before_s, np.float64)
-
-
-def scan_points(scan: Stamped[RangeImage], c: RangeScannerCapabilities, track: ScannerTrack) -> Array:
-    """Return the points (n, 3) of one scan in the base frame, metres, without beams that measured nothing.
-
-    Raises:
-        InvalidRequest: the scan is not that of a line scanner.
-        StaleReading: the track does not cover the scan.
-    """
-    in_scanner_m, times_s = _beams(scan, c)
-    return track.in_base(in_scanner_m, times_s) if len(times_s) else np.empty((0, 3))
 
 
 def _beams(scan: Stamped[RangeImage], c: RangeScannerCapabilities) -> tuple[Array, Array]:

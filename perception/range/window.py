@@ -34,15 +34,9 @@ class Window:
         """Difference in depth between neighbouring codes."""
         return (self.far_m - self.near_m) / self.levels
 
-    def decode(self, codes: ArrayLike, *, invalid: int | None = None) -> Array:
-        """Return the depth in metres, as float64, of integer codes of any shape; the code `invalid` becomes NaN."""
-        raw = np.asarray(codes)
-        if raw.dtype.kind not in "iu":
-            raise InvalidRequest(f"codes must be integers, not {raw.dtype}", hint="pass the coded image itself")
-        depth = self.near_m + raw.astype(np.float64) * self.step_m
-        if invalid is not None:
-            depth[raw == invalid] = np.nan
-        return depth
+    def decode(self, codes: ArrayLike) -> Array:
+        """Return the depth in metres, as float64, of integer codes of any shape."""
+        return self.near_m + _whole(codes) * self.step_m
 
 
 def decode_scaled(codes: ArrayLike, scale_m: float, *, invalid: int = 0) -> Array:
@@ -52,9 +46,15 @@ def decode_scaled(codes: ArrayLike, scale_m: float, *, invalid: int = 0) -> Arra
     """
     if not (scale_m > 0 and np.isfinite(scale_m)):
         raise InvalidRequest(f"scale of {scale_m} m a code is not positive", hint="0.001 for millimetres")
+    whole = _whole(codes)
+    return np.where(whole == invalid, np.nan, whole * scale_m)
+
+
+def _whole(codes: ArrayLike) -> Array:
+    """Return integer codes as float64."""
     raw = np.asarray(codes)
     if raw.dtype.kind not in "iu":
-        raise InvalidRequest(f"codes must be integers, not {raw.dtype}", hint="float depth needs no decoding")
-    depth = raw.astype(np.float64) * scale_m
-    depth[raw == invalid] = np.nan
-    return depth
+        raise InvalidRequest(
+            f"codes must be integers, not {raw.dtype}", hint="pass the coded image; depth needs no decoding"
+        )
+    return raw.astype(np.float64)

@@ -371,8 +371,8 @@ def _record(session: Session, name: str, device: Any, motion: CartesianPath) -> 
         what = f"{name} gave no valid line in a sweep of {report.duration_s:.1f} s"
         raise NotFound(what, hint=_rate_hint(device.capabilities()))
     arm, mount = kinematics(session), session.mount(name).parent_from_child
-    return SweepPass.recorded(
-        good,
+    return SweepPass(
+        scans=good,
         times_s=tuple(report.log.started_s + report.log.times_s),
         base_from_scanner=tuple(arm.tool(q, mount) for q in report.log.positions_rad),
     )

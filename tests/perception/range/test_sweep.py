@@ -14,13 +14,11 @@ from hal.readings import Cause, Quality, Stamped
 from perception.range import PinholeSensor, fit_plane_near
 from perception.range.from_points import image_from_points
 from perception.range.sweep import (
-    ScannerTrack,
     SweepPass,
     SweptErrors,
     beam_times_s,
     delay_between,
     image_from_sweep,
-    scan_points,
 )
 
 LINE = RangeScannerCapabilities(
@@ -62,9 +60,10 @@ def wrist_at(time_s: float) -> RigidTransform:
     )
 
 
-def track() -> ScannerTrack:
+def swept(*scans: Stamped[RangeImage]) -> SweepPass:
     times_s = list(np.arange(-0.2, 1.4, 0.008))
-    return ScannerTrack(times_s=times_s, base_from_scanner=[wrist_at(t) * WRIST_FROM_SCANNER for t in times_s])
+    poses = [wrist_at(t) * WRIST_FROM_SCANNER for t in times_s]
+    return SweepPass(scans=scans, times_s=times_s, base_from_scanner=poses)
 
 
 def scan_of_the_plane(end_s: float) -> Stamped[RangeImage]:
@@ -81,14 +80,14 @@ def scan_of_the_plane(end_s: float) -> Stamped[RangeImage]:
 
 def test_the_points_of_a_moving_scanner_lie_on_the_plane() -> None:
     scans = [scan_of_the_plane(0.1 * i) for i in range(1, 10)]
-    points = np.concatenate([scan_points(scan, LINE, track()) for scan in scans])
+    points = swept(*scans).points(LINE, 0.0)
     assert len(points) == 9 * LINE.width
     assert np.max(np.abs(points[:, 2] - PLANE_Z_M)) < 2e-4
 
 
 def test_poses_of_another_time_would_bend_it() -> None:
     late = Stamped(value=scan_of_the_plane(0.5).value, host_time_s=0.6, sequence=1)
-    assert np.max(np.abs(scan_points(late, LINE, track())[:, 2] - PLANE_Z_M)) > 5e-3
+    assert np.max(np.abs(swept(late).points(LINE, 0.0)[:, 2] - PLANE_Z_M)) > 5e-3
 
 
 def test_the_last_beam_ends_the_scan_and_the_scanner_turns_steadily() -> None:
@@ -102,22 +101,22 @@ def test_unseen_beams_and_invalid_scans_give_no_points() -> None:
     depth_m[0, 90] = 1.0
     one = Stamped(value=RangeImage(depth_m=depth_m), host_time_s=0.5, sequence=1)
     bad = Stamped(value=one.value, host_time_s=0.5, sequence=2, quality=Quality.INVALID, cause=Cause.OUT_OF_RANGE)
-    assert scan_points(one, LINE, track()).shape == (1, 3)
-    assert scan_points(bad, LINE, track()).shape == (0, 3)
+    assert swept(one).points(LINE, 0.0).shape == (1, 3)
+    assert swept(bad).points(LINE, 0.0).shape == (0, 3)
 
 
 def test_times_without_poses_are_refused() -> None:
     with pytest.raises(StaleReading, match="no arm pose"):
-        track().in_base(np.ones((1, 3)), np.array([5.0]))
+        swept().in_base(np.ones((1, 3)), np.array([5.0]))
     with pytest.raises(StaleReading, match="gap"):
-        ScannerTrack(times_s=[0.0, 0.5], base_from_scanner=[identity(), identity()]).in_base(
+        SweepPass(scans=[], times_s=[0.0, 0.5], base_from_scanner=[identity(), identity()]).in_base(
             np.ones((1, 3)), np.array([0.25])
         )
 
 
 def test_only_lines_are_swept() -> None:
     with pytest.raises(InvalidRequest, match="lines"):
-        scan_points(scan_of_the_plane(0.5), IMAGE, track())
+        swept(scan_of_the_plane(0.5)).points(IMAGE, 0.0)
 
 
 def nodding_over_a_plane(
@@ -145,7 +144,7 @@ def nodding_over_a_plane(
         range_m = away_m / (along @ NORMAL) + rng.normal(0.0, sigma_m, FINE.width)
         value = RangeImage(depth_m=np.array([range_m], np.float32))
         scans.append(Stamped(value=value, host_time_s=float(end_s) + late_s, sequence=k))
-    return SweepPass(scans=scans, track=ScannerTrack(times_s=list(times_s), base_from_scanner=poses))
+    return SweepPass(scans=scans, times_s=list(times_s), base_from_scanner=poses)
 
 
 NORMAL = np.array([0.2, -0.1, -0.97]) / np.linalg.norm([0.2, -0.1, -0.97])
@@ -230,8 +229,8 @@ def test_passes_that_lie_apart_make_the_plane_as_uncertain_as_half_of_their_dist
     first = nodding_over_a_plane(1, 1e-4)
     moved = nodding_over_a_plane(2, 1e-4, sign=-1.0)
     apart = RigidTransform.from_translation(4e-4 * NORMAL)
-    track = replace(moved.track, base_from_scanner=[apart * pose for pose in moved.track.base_from_scanner])
-    passes = [first, replace(moved, track=track)]
+    turned = replace(moved, base_from_scanner=[apart * pose for pose in moved.base_from_scanner])
+    passes = [first, turned]
     image = image_from_sweep(passes, FINE, base_from_view=identity(), half_height_rad=0.45, swept_rad=0.9)
     sigmas_m = [
         fit_plane_near(image.depth_m, image.view, point_m=POINT_M, normal=NORMAL, swept=errors).feature.sigma_point_m
@@ -255,8 +254,7 @@ def test_a_mount_that_needs_no_turn_adds_nothing() -> None:
 
 
 def test_scans_before_the_first_pose_are_left_out_and_none_at_all_is_said() -> None:
-    track = ScannerTrack(times_s=[9.0, 9.1], base_from_scanner=[identity(), identity()])
-    passes = [SweepPass(scans=nodding_over_a_plane(0, 0.0).scans, track=track)]
+    passes = [replace(nodding_over_a_plane(0, 0.0), times_s=[9.0, 9.1], base_from_scanner=[identity(), identity()])]
     for given in (passes, 2 * passes):
         with pytest.raises(NotFound, match="none of the points"):
             image_from_sweep(given, FINE, base_from_view=identity(), half_height_rad=0.45, swept_rad=0.9)

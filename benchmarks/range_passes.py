@@ -54,7 +54,7 @@ def none_joined(_regions: Any, kinds: list[int], _parameters: Any) -> list[int]:
 PASSES: dict[str, tuple[Replacement, ...]] = {
     WHOLE: (),
     "noise widening": ((segment, "WIDENINGS", 0),),
-    "finer blocks": ((segment, "_finer", handing_back(2)),),
+    "finer blocks": ((segment, "_add_small_surfaces", handing_back(2)),),
     "merging neighbours": ((merge, "merge_touching", none_joined),),
     "joining pieces": ((join, "join_pieces", none_joined),),
     "icm": ((analysis, "icm_labels", handing_back(2)),),

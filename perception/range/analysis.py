@@ -6,9 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from hal.arrays import Array
+from hal.arrays import Array, Labels
 from hal.errors import InvalidRequest, NotFound
 from hal.jit import compiled
 from perception.range.features import RangeFeature, features_of
@@ -22,8 +22,6 @@ from perception.range.segmentation.regions import Regions, regions_of
 from perception.range.segmentation.segment import Task, icm_labels, segment
 from perception.range.sensor import RangeSensorModel
 from perception.range.straight import doubt_about
-
-Labels = NDArray[np.int32]
 
 LEAST_VALID_PIXELS = 16
 ICM_SWEEPS = 4
@@ -174,10 +172,8 @@ def _finished(task: Task, noise: NoiseModel, regions: Regions, found: Candidates
     depth, packed, law = task.depth_m, task.packed, noise.packed()
     pixels = regions.pixels
     keep = sorted((k for k, n in enumerate(pixels, 1) if n >= LEAST_KEPT_PIXELS), key=lambda k: -pixels[k - 1])
-    surfaces, kinds, ths = finish.refine_surfaces(keep, found.kinds, found.parameters, regions, noise)
-    final = Candidates()
-    for kind, th in zip(kinds, ths, strict=True):
-        final.add(kind, th)
+    surfaces, ths = finish.refine_surfaces(keep, found.kinds, found.parameters, regions, noise)
+    final = Candidates([found.kinds[k - 1] for k in keep], ths)
     names = np.zeros(len(pixels) + 1, np.int32)
     names[keep] = np.arange(1, len(keep) + 1)
     labels = icm_labels(task, noise, regions.renamed(names), final, sweeps=ICM_SWEEPS)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled
-from perception.range.fitting.initialisation import principal_axes
+from perception.range.fitting.initialisation import ellipsoid
 from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, QUADRIC, SIZE, SPHERE, frame_of, step_into
 
 
@@ -129,46 +129,19 @@ def primitive_of(kind: int, th: Array, middle_m: Array) -> Primitive:
     """
     if kind == PLANE:
         normal = th[:3].copy()
-        return Plane(point_m=_along(middle_m, float(th[3]) - _dot(normal, middle_m), normal), normal=normal)
+        return Plane(point_m=middle_m + (th[3] - normal @ middle_m) * normal, normal=normal)
     if kind == SPHERE:
         return Sphere(centre_m=th[:3].copy(), radius_m=float(th[3]), seen_from_inside=bool(th[4] < 0))
     if kind == CYLINDER:
         axis = th[3:6].copy()
-        point = _along(th[:3], _dot(axis, middle_m) - _dot(axis, th[:3]), axis)
+        point = th[:3] + (axis @ middle_m - axis @ th[:3]) * axis
         return Cylinder(point_m=point, axis=axis, radius_m=float(th[6]), seen_from_inside=bool(th[7] < 0))
     if kind == CONE:
         return Cone(
             apex_m=th[:3].copy(), axis=th[3:6].copy(), half_angle_rad=float(th[6]), seen_from_inside=bool(th[7] < 0)
         )
-    return ellipsoid_of(th)
-
-
-def _dot(a: Array, b: Array) -> float:
-    """Return the dot product of two vectors (3,); at this size plain numbers are faster than arrays."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return float(ax * bx + ay * by + az * bz)
-
-
-def _along(point: Array, distance: float, direction: Array) -> Array:
-    """Return the point (3,) at the given distance from another point in a direction."""
-    (x, y, z), (dx, dy, dz) = point.tolist(), direction.tolist()
-    return np.array([x + distance * dx, y + distance * dy, z + distance * dz])
-
-
-def ellipsoid_of(th: Array) -> Ellipsoid:
-    """Return centre, radii and axes of a QUADRIC parameter vector that is an ellipsoid.
-
-    With X = centre + s Y and Y' A Y + 2 b' Y + c = 0: Y0 = -A^-1 b, radii_i = s sqrt((b' A^-1 b - c) / lambda_i).
-    """
-    A = np.array(
-        [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
-    )
-    b = 0.5 * th[10:13]
-    values, vectors = np.linalg.eigh(A)
-    y0 = -np.linalg.solve(A, b)
-    level = float(-b @ y0 - th[13])
-    radii = th[3] * np.sqrt(np.maximum(level / values, 0.0))
-    return Ellipsoid(centre_m=th[:3] + th[3] * y0, radii_m=radii, axes=vectors)
+    centre, radii, axes = ellipsoid(th)
+    return Ellipsoid(centre_m=centre, radii_m=radii, axes=axes)
 
 
 def frame_vectors(kind: int, th: Array) -> Array:
@@ -202,23 +175,7 @@ def _shape_jacobian(th: Array, step: Array) -> Array:
         delta[k] = -step[k]
         step_into(QUADRIC, th, frame, delta, before)
         delta[k] = 0.0
-        J[:, k] = (centre_and_radii(after) - centre_and_radii(before)) / (2.0 * step[k])
+        (centre, radii, _), (centre_2, radii_2, _) = ellipsoid(before), ellipsoid(after)
+        J[:3, k] = (centre_2 - centre) / (2.0 * step[k])
+        J[3:, k] = (radii_2 - radii) / (2.0 * step[k])
     return J
-
-
-@compiled
-def centre_and_radii(th: Array) -> Array:
-    """Return centre and radii (6,) of a QUADRIC as `ellipsoid_of` does, in compiled code."""
-    A = np.array(
-        [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
-    )
-    values, vectors = principal_axes(A)
-    out, level = th[:6].copy(), -th[13]
-    for k in range(3):
-        t = 0.5 * (vectors[0, k] * th[10] + vectors[1, k] * th[11] + vectors[2, k] * th[12])
-        level += t * t / values[k]
-        for a in range(3):
-            out[a] -= th[3] * vectors[a, k] * t / values[k]
-    for k in range(3):
-        out[3 + k] = th[3] * np.sqrt(max(level / values[k], 0.0))
-    return out

@@ -3,7 +3,7 @@
 The error of the sensor lies along its ray, so the residual is `(z_measured - z_surface) / sigma(z)`. Orthogonal
 distances would bias a radius by about sigma^2 / (2 r), and by more at grazing rays. A fit starts robustly, with Cauchy
 weights whose scale falls from round to round; it ends with least squares on the residuals below `TRIM_SIGMAS`
-(see `refine`).
+(see `refine`). Samples are (4, N), N <= CHUNK: ray coordinates x and y, depth z and its standard deviation.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from hal.arrays import Array, Mask
 from hal.jit import as_numpy_scalar, compiled
-from perception.range.fitting.equations import MISS_SIGMAS, error_row, residuals_by_chunks
+from perception.range.fitting.equations import MISS_SIGMAS, TRIM_SIGMAS, error_row
 from perception.range.fitting.initialisation import (
     is_ellipsoid,
     normal_axis,
@@ -22,8 +22,8 @@ from perception.range.fitting.initialisation import (
     start_plane,
     start_sphere,
 )
-from perception.range.fitting.rays import CHUNK, ERROR, FILLED, LOADED, NOTHING, fill_rows, load_rows
-from perception.range.fitting.refine import Scratch, new_scratch, refine
+from perception.range.fitting.rays import ERROR, FILLED, LOADED, fill_rows
+from perception.range.fitting.refine import Scratch, refine, scratch_of
 from perception.range.fitting.surfaces import (
     CONE,
     CYLINDER,
@@ -35,7 +35,6 @@ from perception.range.fitting.surfaces import (
     frame_of,
 )
 
-TRIM_SIGMAS = 3.0  # samples with larger residuals are outliers in the final least squares
 PER_MEDIAN = 1.4826  # standard deviation of a normal distribution per median of its absolute value
 SCALE_PRECISION = 0.004  # relative precision of `middle_scale`
 FALLS = 0.95  # another round with Cauchy weights follows only if the scale falls below this share of the previous one
@@ -47,37 +46,18 @@ ELLIPSOID_GIVE_UP = 14.0
 LARGEST_RADIUS_M = 10.0  # fits of spheres and cylinders with a larger radius are rejected
 LEAST_NORMALS = 10  # normals needed to start any kind but a plane
 QUADRIC_PER_SAMPLE = 1.15  # a simple surface under white noise costs about 0.95 per sample plus its parameter penalty
-FIRST = as_numpy_scalar(0)
 AROUND_ZERO, AROUND_MEAN = as_numpy_scalar(False), as_numpy_scalar(True)  # centre of the scatter matrix of the normals
 
 
 @compiled
-def _load(x: Array, y: Array, z: Array, sigma: Array, work: Array) -> int:
-    """Load the samples into `work` if there are at most CHUNK of them; returns LOADED or NOTHING."""
-    if x.shape[0] > CHUNK:
-        return NOTHING
-    load_rows(x, y, z, sigma, FIRST, x.shape[0], work)
-    return LOADED
-
-
-@compiled
-def _fill_errors(
-    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool,
-    scratch: Scratch, held: int,
-) -> int:  # fmt: skip
-    """Compute the residuals (N,) in sigmas; returns which rows of `scratch` are valid afterwards.
-
-    They go into row ERROR if `scratch` holds the samples, and otherwise into `errors`.
-    """
-    work, frame, n = scratch.work, scratch.trial.frame, x.shape[0]
-    if held == NOTHING:
-        residuals_by_chunks(kind, th, x, y, z, sigma, perspective, frame, work, scratch.errors)
-    elif held == LOADED:
-        frame_of(kind, th, frame)
-        fill_rows(kind, th, frame, n, perspective, work)
-        error_row(n, work)
-        held = FILLED
-    return held
+def _fill_errors(kind: int, th: Array, n: int, perspective: bool, scratch: Scratch, held: int) -> int:
+    """Compute row ERROR of `scratch`, the residuals in sigmas, unless it is `held`; returns which rows are valid then."""
+    if held != LOADED:
+        return held
+    frame_of(kind, th, scratch.trial.frame)
+    fill_rows(kind, th, scratch.trial.frame, n, perspective, scratch.work)
+    error_row(n, scratch.work)
+    return FILLED
 
 
 @compiled
@@ -107,43 +87,36 @@ def middle_scale(e: Array) -> float:
 
 
 @compiled
-def fit_robust(
-    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask, rounds: int,
-) -> tuple[Array, float]:  # fmt: skip
+def fit_robust(kind: int, th: Array, samples: Array, perspective: bool, rounds: int) -> tuple[Array, float]:
     """Fit with Cauchy weights whose scale falls with the residuals, then with trimmed least squares.
 
     Returns the parameters and the trimmed cost: the sum of squared residuals in squared sigmas, each at most
-    `TRIM_SIGMAS` squared. `th` holds the initial parameters, `fixed` (9,) tells which of them stay, and `rounds` is the
-    largest number of rounds with Cauchy weights.
+    `TRIM_SIGMAS` squared. `th` holds the initial parameters, and `rounds` is the largest number of rounds with Cauchy
+    weights.
     """
-    th, scratch = th.copy(), new_scratch(x.shape[0])
-    _, _, cost = _robust(kind, th, x, y, z, sigma, perspective, fixed, rounds, scratch)
+    th = th.copy()
+    _, _, cost = _robust(kind, th, samples.shape[1], perspective, rounds, scratch_of(samples))
     return th, cost
 
 
 @compiled
 def _robust(
-    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask, rounds: int,
-    scratch: Scratch,
+    kind: int, th: Array, n: int, perspective: bool, rounds: int, scratch: Scratch,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Fit as `fit_robust`, but update `th` in place.
+    """Fit as `fit_robust` to the `n` samples in `scratch`, but update `th` in place.
 
     Returns the mean squared residual of the kept samples, the share kept, and the trimmed cost.
     """
-    n = x.shape[0]
-    e = scratch.work[ERROR : ERROR + n] if n <= CHUNK else scratch.errors[:n]
-    held, is_last, before, cost, used = _load(x, y, z, sigma, scratch.work), rounds == 0, np.inf, 0.0, 0
+    held, is_last, before, cost, used = LOADED, rounds == 0, np.inf, 0.0, 0
     for turn in range(rounds + 1):
         scale, steps = 0.0, 3
         if not is_last:
-            held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
-            middle = middle_scale(e)
+            held = _fill_errors(kind, th, n, perspective, scratch, held)
+            middle = middle_scale(scratch.work[ERROR : ERROR + n])
             is_last = middle > FALLS * before  # nearly the same weights would give the same surface again
             if not is_last:
                 scale, steps, before = middle, 4, middle
-        cost, used, held = refine(
-            kind, th, x, y, z, sigma, perspective, steps, scale, TRIM_SIGMAS, fixed, scratch, held
-        )
+        cost, used, held = refine(kind, th, n, perspective, steps, scale, scratch, held)
         if is_last:
             break
         is_last = scale <= 1.05 or turn + 1 == rounds
@@ -152,23 +125,18 @@ def _robust(
 
 
 @compiled
-def _rough(
-    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, fixed: Mask,
-    scratch: Scratch,
-) -> float:  # fmt: skip
+def _rough(kind: int, th: Array, n: int, perspective: bool, scratch: Scratch) -> float:
     """Update `th` by a few robust steps; returns the sum of squared residuals, each capped at `ROUGH_LIMIT` squared."""
-    n = x.shape[0]
-    e = scratch.work[ERROR : ERROR + n] if n <= CHUNK else scratch.errors[:n]
-    held, steps = _load(x, y, z, sigma, scratch.work), ROUGH_STEPS
-    held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+    e, steps = scratch.work[ERROR : ERROR + n], ROUGH_STEPS
+    held = _fill_errors(kind, th, n, perspective, scratch, LOADED)
     for _ in range(2):
         scale = middle_scale(e)
-        _, _, held = refine(kind, th, x, y, z, sigma, perspective, steps, scale, TRIM_SIGMAS, fixed, scratch, held)
-        held = _fill_errors(kind, th, x, y, z, sigma, perspective, scratch, held)
+        _, _, held = refine(kind, th, n, perspective, steps, scale, scratch, held)
+        held = _fill_errors(kind, th, n, perspective, scratch, held)
         if scale < 1.5:
             break
     cost = 0.0
-    for i in range(e.shape[0]):
+    for i in range(n):
         cost += min(e[i] * e[i], ROUGH_LIMIT * ROUGH_LIMIT) if np.isfinite(e[i]) else ROUGH_LIMIT * ROUGH_LIMIT
     return cost
 
@@ -177,22 +145,29 @@ def _rough(
 def rough_mean_square(kind: int, th: Array, samples: Array, perspective: bool) -> float:
     """Return the mean squared residual of a rough fit that starts at `th`, each capped at `ROUGH_LIMIT` squared.
 
-    `samples` (4, N) are x, y, z, sigma; about `ROUGH_SAMPLES` of them are used. Residuals are in sigmas.
+    About `ROUGH_SAMPLES` of the samples are used. Residuals are in sigmas.
     """
     few = np.ascontiguousarray(samples[:, :: max(1, samples.shape[1] // ROUGH_SAMPLES)])
-    free, scratch = np.zeros(9, np.bool_), new_scratch(few.shape[1])
-    cost = _rough(kind, th.copy(), few[0], few[1], few[2], few[3], perspective, free, scratch)
-    return float(cost / few.shape[1])
+    return float(_rough(kind, th.copy(), few.shape[1], perspective, scratch_of(few)) / few.shape[1])
+
+
+@compiled
+def points_of(samples: Array, perspective: bool) -> Array:
+    """Return the positions (N, 3) of the samples, metres."""
+    out = np.empty((samples.shape[1], 3))
+    for i in range(samples.shape[1]):
+        scale = samples[2, i] if perspective else 1.0
+        out[i, 0], out[i, 1], out[i, 2] = samples[0, i] * scale, samples[1, i] * scale, samples[2, i]
+    return out
 
 
 @compiled
 def fit_kinds(
-    points: Array, P: Array, N: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, kinds: Mask,
-    correlated_samples: float, give_up: float,
+    samples: Array, normals: Array, perspective: bool, kinds: Mask, correlated_samples: float, give_up: float,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Fit every kind in the (5,) mask `kinds` to one set of samples, `points` (N, 3).
+    """Fit every kind in the (5,) mask `kinds` to one set of samples.
 
-    `P` and `N` (M, 3) are the points that have a tangent plane, and its normals; only the initialisation uses them.
+    `normals` (N, 3) are those of the tangent planes there, NaN where there is none; only the initialisation uses them.
     Every kind first takes a few robust steps on a subset of about `ROUGH_SAMPLES` samples. A kind is fitted fully only
     if its rough cost is close to the best one and its mean squared residual (each capped at `ROUGH_LIMIT` squared) is
     at most `give_up`.
@@ -202,19 +177,19 @@ def fit_kinds(
     """
     ths = np.zeros((5, SIZE))
     mean2, kept, score = np.full(5, np.inf), np.zeros(5), np.full(5, np.inf)
-    n = x.shape[0]
+    n, points = samples.shape[1], points_of(samples, perspective)
+    known = np.isfinite(normals[:, 0])
+    P, N = points[known], normals[known]
     price = np.log(max(n / correlated_samples, 2.0))
-    free, scratch, rounds = np.zeros(9, np.bool_), new_scratch(n), np.array([2, 2, 2, 2, 3])
-    stride = max(1, n // ROUGH_SAMPLES)
-    rx, ry, rz, rs = x[::stride].copy(), y[::stride].copy(), z[::stride].copy(), sigma[::stride].copy()
-    per_sample = rx.shape[0] / correlated_samples
+    few = np.ascontiguousarray(samples[:, :: max(1, n // ROUGH_SAMPLES)])
+    few_scratch, scratch, rounds = scratch_of(few), scratch_of(samples), np.array([2, 2, 2, 2, 3])
+    per_sample = few.shape[1] / correlated_samples
     starts, rough, best_rough = np.zeros((QUADRIC, SIZE)), np.full(QUADRIC, np.inf), np.inf
     for kind in range(QUADRIC):
         if kind == CONE and best_rough < 1.3 * per_sample:
             break  # a cone is tried only if no simpler kind fits
         if kinds[kind] and _start(kind, points, P, N, starts[kind]):
-            cost = _rough(kind, starts[kind], rx, ry, rz, rs, perspective, free, scratch)
-            rough[kind] = cost / correlated_samples
+            rough[kind] = _rough(kind, starts[kind], few.shape[1], perspective, few_scratch) / correlated_samples
             best_rough = min(best_rough, rough[kind])
     # A kind whose rough cost is clearly above the best one cannot have the best score.
     behind = 2.0 * best_rough + 0.5 * per_sample
@@ -223,26 +198,28 @@ def fit_kinds(
         if not rough[kind] <= min(behind, give_up):
             continue
         th = starts[kind].copy()
-        m, share, cost = _robust(kind, th, x, y, z, sigma, perspective, free, rounds[kind], scratch)
+        m, share, cost = _robust(kind, th, n, perspective, rounds[kind], scratch)
         s = cost / correlated_samples + FREEDOM[kind] * price
         if s < score[kind] and _is_sane(kind, th):
             ths[kind], mean2[kind], kept[kind], score[kind] = th, m, share, s
     is_near = rough[SPHERE] <= behind and best_rough <= ELLIPSOID_GIVE_UP * per_sample
-    if kinds[QUADRIC] and is_near and starts[SPHERE, 3] < LARGEST_RADIUS_M:
-        # A quadric has nine parameters and fits almost anything, so it is tried only if no simpler kind fits.
-        simple = np.min(score)
-        if simple > n / correlated_samples * QUADRIC_PER_SAMPLE:
-            th = quadric_of_sphere(starts[SPHERE])
-            m, share, cost = _robust(QUADRIC, th, x, y, z, sigma, perspective, free, rounds[QUADRIC], scratch)
-            if is_ellipsoid(th):
-                ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, share
-                score[QUADRIC] = cost / correlated_samples + 9 * price
+    # A quadric has nine parameters and fits almost anything, so it is tried only if no simpler kind fits.
+    is_wanted = kinds[QUADRIC] and np.min(score) > n / correlated_samples * QUADRIC_PER_SAMPLE
+    if is_wanted and is_near and starts[SPHERE, 3] < LARGEST_RADIUS_M:
+        th = quadric_of_sphere(starts[SPHERE])
+        m, share, cost = _robust(QUADRIC, th, n, perspective, rounds[QUADRIC], scratch)
+        if is_ellipsoid(th):
+            ths[QUADRIC], mean2[QUADRIC], kept[QUADRIC] = th, m, share
+            score[QUADRIC] = cost / correlated_samples + 9 * price
     return ths, mean2, kept, score
 
 
 @compiled
 def _start(kind: int, points: Array, P: Array, N: Array, th: Array) -> bool:
-    """Fill `th` with the algebraic initial parameters of a kind other than QUADRIC; returns whether they exist."""
+    """Fill `th` with the algebraic initial parameters of a kind other than QUADRIC; returns whether they exist.
+
+    `P` and `N` (M, 3) are the points that have a tangent plane, and its normals.
+    """
     if kind == PLANE:
         th[:] = start_plane(points)
         return True

@@ -55,30 +55,14 @@ def principal_axes(S: Array) -> tuple[Array, Array]:
 @compiled
 def centroid(P: Array) -> Array:
     """Return the mean (3,) of points (N, 3)."""
-    c = np.zeros(3)
-    n = P.shape[0]
-    for i in range(n):
-        for a in range(3):
-            c[a] += P[i, a]
-    for a in range(3):
-        c[a] /= n
-    return c
+    return np.array([np.mean(P[:, 0]), np.mean(P[:, 1]), np.mean(P[:, 2])])
 
 
 @compiled
 def scatter(P: Array, c: Array) -> Array:
     """Return the scatter matrix (3, 3) of points (N, 3) about c: the sum of (P_i - c)(P_i - c)'."""
-    S = np.zeros((3, 3))
-    for i in range(P.shape[0]):
-        x, y, z = P[i, 0] - c[0], P[i, 1] - c[1], P[i, 2] - c[2]
-        S[0, 0] += x * x
-        S[1, 1] += y * y
-        S[2, 2] += z * z
-        S[0, 1] += x * y
-        S[0, 2] += x * z
-        S[1, 2] += y * z
-    S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
-    return S
+    off = P - c
+    return off.T @ off
 
 
 @compiled
@@ -97,19 +81,10 @@ def start_plane(P: Array) -> Array:
 @compiled
 def _least_squares(rows: Array, values: Array) -> tuple[Array, bool]:
     """Solve rows (N, m) x = values (N,) by normal equations; returns x and whether there is a solution."""
-    n, m = rows.shape
-    A, b = np.zeros((m, m)), np.zeros(m)
-    for i in range(n):
-        for j in range(m):
-            r = rows[i, j]
-            b[j] += r * values[i]
-            for k in range(j + 1):
-                A[j, k] += r * rows[i, k]
-    for j in range(m):
-        for k in range(j):
-            A[k, j] = A[j, k]
+    A, b = rows.T @ rows, rows.T @ values
+    for j in range(b.shape[0]):
         A[j, j] = A[j, j] * (1.0 + 1e-9) + 1e-18
-    return b, solve_positive(A, b, m)
+    return b, solve_positive(A, b, b.shape[0])
 
 
 @compiled
@@ -225,17 +200,29 @@ def quadric_of_sphere(th: Array) -> Array:
 
 
 @compiled
-def is_ellipsoid(th: Array) -> bool:
-    """Return whether the quadric is a real ellipsoid whose longest radius is less than 8 times the shortest."""
+def ellipsoid(th: Array) -> tuple[Array, Array, Array]:
+    """Return centre (3,), radii (3,), longest first, and axes (3, 3), in columns, of a quadric.
+
+    With X = centre + s Y and Y' A Y + 2 b' Y + c = 0: Y0 = -A^-1 b, radii_i = s sqrt((b' A^-1 b - c) / lambda_i), which
+    is 0 where the quadric is no ellipsoid in that direction.
+    """
     A = np.array(
         [[th[4], 0.5 * th[7], 0.5 * th[8]], [0.5 * th[7], th[5], 0.5 * th[9]], [0.5 * th[8], 0.5 * th[9], th[6]]]
     )
-    b = 0.5 * th[10:13]
-    w, V = principal_axes(A)
-    if w[0] <= 1e-3:
-        return False
-    t = np.empty(3)
+    values, vectors = principal_axes(A)
+    centre, radii, level = th[:3].copy(), np.empty(3), -th[13]
     for k in range(3):
-        t[k] = V[0, k] * b[0] + V[1, k] * b[1] + V[2, k] * b[2]
-    rest = t[0] * t[0] / w[0] + t[1] * t[1] / w[1] + t[2] * t[2] / w[2] - th[13]
-    return bool(rest > 0 and w[2] < 64.0 * w[0])
+        t = 0.5 * (vectors[0, k] * th[10] + vectors[1, k] * th[11] + vectors[2, k] * th[12])
+        level += t * t / values[k]
+        for a in range(3):
+            centre[a] -= th[3] * vectors[a, k] * t / values[k]
+    for k in range(3):
+        radii[k] = th[3] * np.sqrt(max(level / values[k], 0.0))
+    return centre, radii, vectors
+
+
+@compiled
+def is_ellipsoid(th: Array) -> bool:
+    """Return whether the quadric is a real ellipsoid whose longest radius is less than 8 times the shortest."""
+    _, radii, _ = ellipsoid(th)
+    return bool(0.0 < radii[0] < 8.0 * radii[2])

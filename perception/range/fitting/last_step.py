@@ -7,18 +7,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.arrays import Array, Labels, Mask
-from hal.jit import REORDERED, compiled
-from perception.range.fitting.equations import add_equations, mirror
-from perception.range.fitting.fit import TRIM_SIGMAS
+from hal.arrays import Array, Labels
+from hal.jit import REORDERED, as_numpy_scalar, compiled
+from hal.least_squares import solve_damped
+from hal.small_algebra import LEAST_PIVOT
+from perception.range.fitting.equations import TRIM_SIGMAS, add_equations
 from perception.range.fitting.rays import CHUNK, SCRATCH, SIGMA, X, Y, Z, fill_rows
-from perception.range.fitting.refine import free_step
+from perception.range.fitting.refine import FLOOR
 from perception.range.fitting.surfaces import FREEDOM, GRAZING_COSINE, PLANE, SIZE, frame_of, step_into
+
+STEP_FOLLOWS = as_numpy_scalar(True)
 
 
 @compiled
 def last_step(
-    kind: int, th: Array, depth: Array, sen: Array, noise: Array, runs: Labels, fixed: Mask,
+    kind: int, th: Array, depth: Array, sen: Array, noise: Array, runs: Labels,
 ) -> tuple[Array, Array, float, int]:  # fmt: skip
     """Take one Gauss-Newton step on the pixels of runs (R, 3), in one pass, from parameters that are already close.
 
@@ -32,11 +35,11 @@ def last_step(
     H, g, frame = np.zeros((9, 9)), np.zeros(9), np.empty(6)
     frame_of(kind, th, frame)
     kept, used = _equations(kind, th, frame, depth, sen, noise, runs, np.empty(SCRATCH), H, g)
-    A, step = np.empty((p, p)), np.empty(p)
-    if used <= p or not free_step(H, g, fixed, 0.0, p, A, step):
+    step = g.copy()
+    if used <= p or solve_damped(H, H, 0.0, FLOOR, LEAST_PIVOT, step, np.empty((p, p)), p) < 0.0:
         return th, H, kept, used
     for a in range(p):
-        kept -= 0.0 if fixed[a] else g[a] * step[a]
+        kept -= g[a] * step[a]
     moved = np.empty(SIZE)
     step_into(kind, th, frame, step, moved)
     return moved, H, max(kept, 0.0), used
@@ -62,15 +65,18 @@ def _equations(
             _load(depth[v, first : first + m], first, v, sen, work[n:])
             n, first = n + m, first + m
             if n == CHUNK or (i == last and first == end):
-                _fill_variances(n, noise, work)
+                variances = work[SIGMA : SIGMA + n]
+                fill_variances(work[Z : Z + n], noise, variances)
                 if kind == PLANE:
                     more, hits = _add_plane(th, frame, n, perspective, work, H, g)
                 else:
-                    _take_roots(n, work)
+                    variances[:] = np.sqrt(variances)
                     fill_rows(kind, th, frame, n, perspective, work)
-                    more, hits = add_equations(kind, n, 0.0, TRIM_SIGMAS, work, H, g)
+                    more, hits = add_equations(kind, n, 0.0, work, H, g, STEP_FOLLOWS)
                 cost, used, n = cost + more, used + hits, 0
-    mirror(FREEDOM[kind], H)
+    for a in range(FREEDOM[kind]):
+        for b in range(a):
+            H[b, a] = H[a, b]
     return max(cost - (pixels - used) * TRIM_SIGMAS * TRIM_SIGMAS, 0.0), int(used)
 
 
@@ -135,19 +141,11 @@ def _add_plane(
     return cost, used
 
 
-@compiled
-def _take_roots(n: int, work: Array) -> None:
-    """Replace the variances in row SIGMA by standard deviations."""
-    for k in range(n):
-        work[SIGMA + k] = np.sqrt(work[SIGMA + k])
-
-
 @compiled(fastmath=REORDERED)
-def _fill_variances(n: int, noise: Array, work: Array) -> None:
-    """Write the variance (`sigma_at` squared) of each loaded depth into row SIGMA, without a branch."""
+def fill_variances(z: Array, noise: Array, out: Array) -> None:
+    """Write the variance (`sigma_at` squared) of each depth z (N,) into `out` (N,), without a branch."""
     a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
-    for k in range(n):
-        z = work[Z + k]
-        z2 = z * z
+    for k in range(z.shape[0]):
+        z2 = z[k] * z[k]
         white, slow, step = a + b * z2, c + d * z2, e + f * z2
-        work[SIGMA + k] = max(white * white, step * step * (1.0 / 12.0)) + slow * slow
+        out[k] = max(white * white, step * step * (1.0 / 12.0)) + slow * slow

@@ -1,8 +1,7 @@
 """Vectorised intersection of many rays with one surface: depth, cosine of incidence and derivatives.
 
 On the surface F = 0 the derivative is dz / dtheta = -(dF/dtheta) / (dF/dz); a test compares with plain functions of one
-ray. Samples are
-processed in chunks whose rows fit the first-level cache, and the loop bodies have no branch, so that the compiler
+ray. Samples are processed in rows of one scratch array, and the loop bodies have no branch, so that the compiler
 handles four or eight rays with one instruction: 6 ns per ray with its derivatives, against 80 ns for the reference.
 """
 
@@ -11,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from hal.arrays import Array
-from hal.jit import REORDERED, compiled
+from hal.jit import REORDERED, as_numpy_scalar, compiled
 from perception.range.fitting.surfaces import CONE, CYLINDER, PLANE, SPHERE
 
-CHUNK = 160  # number of samples in a chunk; `merge` fits this many at once
+CHUNK = 304  # largest number of samples of a fit; the rows of more would not fit the cache
 ROWS = [row * CHUNK for row in range(18)]  # where each row of the scratch array begins
 DEPTH, COSINE = ROWS[:2]
 D0, D1, D2, D3, D4, D5, D6, D7, D8 = ROWS[2:11]  # derivatives of depth with respect to the tangent parameters
@@ -22,26 +21,22 @@ WEIGHT, RESIDUAL = ROWS[11:13]
 X, Y, Z, SIGMA = ROWS[13:17]  # the samples
 ERROR = ROWS[17]  # residuals before the robust weights; NaN where a ray misses
 SCRATCH = len(ROWS) * CHUNK
-# Which rows of `work` are valid: none; the samples; also row ERROR of the surface; all rows of the surface.
-NOTHING, LOADED, ERRED, FILLED = range(4)
+# Which rows are valid: the samples; also row ERROR of the surface; all rows.
+LOADED, ERRED, FILLED = (as_numpy_scalar(row) for row in range(3))
 
 
 @compiled
-def load_rows(x: Array, y: Array, z: Array, sigma: Array, first: int, n: int, work: Array) -> None:
-    """Copy samples first .. first + n into `work`.
+def load_rows(samples: Array, work: Array) -> None:
+    """Copy samples (4, N) of x, y, z and sigma, N <= CHUNK, into `work`.
 
     Compiled loops over several arrays test at run time whether these overlap in memory, and their rounding depends on
     the outcome. Loops within one array at fixed offsets need no such test, so equal input gives bit-identical results.
     """
-    x, y, z, sigma = x[first:], y[first:], z[first:], sigma[first:]
-    for i in range(n):
-        work[X + i] = x[i]
-    for i in range(n):
-        work[Y + i] = y[i]
-    for i in range(n):
-        work[Z + i] = z[i]
-    for i in range(n):
-        work[SIGMA + i] = sigma[i]
+    if samples.shape[1] > CHUNK:
+        raise ValueError("more samples than fit the scratch array")
+    for row in range(4):
+        for i in range(samples.shape[1]):
+            work[X + row * CHUNK + i] = samples[row, i]
 
 
 @compiled

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hal.arrays import Array, Labels, Mask
+from hal.arrays import Array, Labels
 from hal.jit import compiled, inlined
-from hal.least_squares import DampingRule, minimise
-from hal.small_algebra import put1, solve_positive
-from perception.range.fitting.equations import normal_equations
-from perception.range.fitting.rays import ERRED, LOADED, SCRATCH
+from hal.least_squares import DampingRule, minimise, solve_damped
+from hal.small_algebra import LEAST_PIVOT, put1
+from perception.range.fitting.equations import add_equations
+from perception.range.fitting.rays import ERRED, FILLED, LOADED, SCRATCH, fill_rows, load_rows
 from perception.range.fitting.surfaces import (
     FREEDOM,
     SIZE,
@@ -44,78 +44,81 @@ class Point(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Work arrays of a fit: the rows of `rays`, a factor (9, 9), two points, and residuals of many samples."""
+    """Work arrays of a fit to some samples: the rows of `rays`, a factor (9, 9), and two points."""
 
     work: Array
     A: Array
     at: Point
     trial: Point
-    errors: Array
 
 
 class Problem(NamedTuple):
-    """Samples, weights and scratch of one descent; see `refine`."""
+    """Kind and number of samples, weights and scratch of one descent; see `refine`."""
 
     kind: int
-    x: Array
-    y: Array
-    z: Array
-    sigma: Array
+    n: int
     perspective: bool
     scale: float
-    trim: float
-    fixed: Mask
-    held: int
     work: Array
     A: Array
 
 
 @compiled
-def new_scratch(samples: int) -> Scratch:
-    """Allocate the work arrays of a fit to at most `samples` samples."""
+def scratch_of(samples: Array) -> Scratch:
+    """Allocate the work arrays of a fit, and load its samples (4, N) into them."""
     small = np.empty(3 * 81 + 4 * 9 + 2 * 6 + 2 * SIZE)  # one allocation instead of many
     H, H2, A = small[:81].reshape((9, 9)), small[81:162].reshape((9, 9)), small[162:243].reshape((9, 9))
     g, g2, step, step2 = small[243:252], small[252:261], small[261:270], small[270:279]
     frame, frame2, th, th2 = small[279:285], small[285:291], small[291 : 291 + SIZE], small[291 + SIZE :]
     used: Labels = np.zeros(2, np.int32)
     at, trial = Point(th, frame, H, g, step, used[:1]), Point(th2, frame2, H2, g2, step2, used[1:])
-    return Scratch(np.empty(SCRATCH), A, at, trial, np.empty(samples))
+    work = np.empty(SCRATCH)
+    load_rows(samples, work)
+    return Scratch(work, A, at, trial)
 
 
 @compiled
 def refine(
-    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, perspective: bool, steps: int, scale: float,
-    trim: float, fixed: Mask, scratch: Scratch, held: int,
+    kind: int, th: Array, n: int, perspective: bool, steps: int, scale: float, scratch: Scratch, held: int,
 ) -> tuple[float, int, int]:  # fmt: skip
     """Minimise the ray residuals with at most `steps` damped Gauss-Newton steps; updates the parameters `th` in place.
 
     Args:
-        x, y, z, sigma: (N,) samples; coordinates as in `Grid`.
-        scale: > 0: width of the Cauchy weights in sigmas; 0: trim at `trim` and plain least squares.
-        fixed: (9,) bool, tangent parameters that stay at their prior value.
-        held: which rows for these samples and `th` are valid in `scratch` (NOTHING, LOADED, ERRED or FILLED).
+        n: number of samples, which `scratch` holds.
+        scale: > 0: width of the Cauchy weights in sigmas; 0: trim and plain least squares.
+        held: which rows for these samples and `th` are valid in `scratch` (LOADED, ERRED or FILLED).
 
     Returns:
         cost, number of samples used, and which rows for the samples and the final `th` are valid in `scratch`.
     """
-    at, work = scratch.at, scratch.work
+    at = scratch.at
     put1(at.th, th)
     frame_of(kind, th, at.frame)
-    cost, at.used[0] = normal_equations(
-        kind, th, at.frame, x, y, z, sigma, perspective, scale, trim, at.H, at.g, work, held, steps > 0
-    )
-    held = min(held, LOADED)
-    problem = Problem(kind, x, y, z, sigma, perspective, scale, trim, fixed, held, work, scratch.A)
+    problem = Problem(kind, n, perspective, scale, scratch.work, scratch.A)
+    if held != FILLED:
+        fill_rows(kind, th, at.frame, n, perspective, scratch.work)
+    cost = linearise(problem, at, steps > 0)
     cost, is_fresh = minimise(solve, move, evaluate, accept, problem, at, scratch.trial, cost, RULE, steps, STEP_GOAL)
     put1(th, at.th)
-    return cost, int(at.used[0]), ERRED if is_fresh and held == LOADED else held
+    return cost, int(at.used[0]), ERRED if is_fresh else LOADED
+
+
+@compiled
+def linearise(problem: Problem, at: Point, step_follows: bool) -> float:
+    """Write the system of the filled rows into `at`, if a step follows; returns the cost."""
+    at.H[:] = 0.0
+    at.g[:] = 0.0
+    cost, used = add_equations(problem.kind, problem.n, problem.scale, problem.work, at.H, at.g, step_follows)
+    at.used[0] = int(used)
+    return cost
 
 
 @inlined(early=True)
 def solve(problem: Problem, at: Point, damping: float) -> float:
     """Write the damped step into `at`; returns its largest entry in standard deviations, -1 where there is no step."""
     p = FREEDOM[problem.kind]
-    if not free_step(at.H, at.g, problem.fixed, damping, p, problem.A, at.step):
+    put1(at.step, at.g)
+    if solve_damped(at.H, at.H, damping, FLOOR, LEAST_PIVOT, at.step, problem.A, p) < 0.0:
         return -1.0
     largest = 0.0
     for a in range(p):
@@ -133,12 +136,9 @@ def move(problem: Problem, at: Point, trial: Point) -> None:
 @inlined(early=True)
 def evaluate(problem: Problem, at: Point, is_last: bool) -> float:
     """Return the cost of a surface and write its equations; the cost is infinite where too few samples are used."""
-    cost, used = normal_equations(
-        problem.kind, at.th, at.frame, problem.x, problem.y, problem.z, problem.sigma, problem.perspective,
-        problem.scale, problem.trim, at.H, at.g, problem.work, problem.held, not is_last,
-    )  # fmt: skip
-    at.used[0] = used
-    return cost if used >= FREEDOM[problem.kind] else np.inf
+    fill_rows(problem.kind, at.th, at.frame, problem.n, problem.perspective, problem.work)
+    cost = linearise(problem, at, not is_last)
+    return cost if at.used[0] >= FREEDOM[problem.kind] else np.inf
 
 
 @inlined(early=True)
@@ -154,19 +154,3 @@ def accept(problem: Problem, at: Point, trial: Point, is_last: bool) -> None:
             at.g[a] = trial.g[a]
             for b in range(FREEDOM[problem.kind]):
                 at.H[a, b] = trial.H[a, b]
-
-
-@compiled
-def free_step(H: Array, g: Array, fixed: Mask, damping: float, p: int, A: Array, step: Array) -> bool:
-    """Write the damped step of the free parameters into `step` (p,), zero for the `fixed` ones; `A` (p, p) is overwritten.
-
-    `H` and `g` are the Gauss-Newton matrix and gradient. Returns False if the matrix is not positive definite. The damping
-    multiplies the diagonal, because another order of rounding (`solve_damped` adds it) changes which surfaces of real
-    images are merged.
-    """
-    for a in range(p):
-        for b in range(a + 1):
-            A[a, b] = 0.0 if fixed[a] or fixed[b] else H[a, b]
-        A[a, a] = 1.0 if fixed[a] else A[a, a] * (1.0 + damping) + FLOOR
-        step[a] = 0.0 if fixed[a] else g[a]
-    return solve_positive(A, step, p)

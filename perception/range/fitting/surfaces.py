@@ -69,31 +69,22 @@ def depth_on(kind: int, th: Array, x: float, y: float, perspective: bool) -> flo
             return np.nan
         return float((th[3] - th[0] * ox - th[1] * oy) / facing)
     wx, wy, wz = ox - th[0], oy - th[1], -th[2]
+    if kind == QUADRIC:
+        return _depth_on_quadric(th, wx, wy, wz, dx, dy)
+    dd, dw, ww = dx * dx + dy * dy + 1.0, dx * wx + dy * wy + wz, wx * wx + wy * wy + wz * wz
     if kind == SPHERE:
-        a = dx * dx + dy * dy + 1.0
-        b = dx * wx + dy * wy + wz
-        return _roots(a, b, wx * wx + wy * wy + wz * wz - th[3] * th[3], th[4])
+        return _roots(dd, dw, ww - th[3] * th[3], th[4])
+    da = dx * th[3] + dy * th[4] + th[5]
+    wa = wx * th[3] + wy * th[4] + wz * th[5]
     if kind == CYLINDER:
-        da = dx * th[3] + dy * th[4] + th[5]
-        wa = wx * th[3] + wy * th[4] + wz * th[5]
-        a = dx * dx + dy * dy + 1.0 - da * da
-        b = dx * wx + dy * wy + wz - da * wa
-        c = wx * wx + wy * wy + wz * wz - wa * wa - th[6] * th[6]
-        return _roots(a, b, c, th[7])
-    if kind == CONE:
-        return _depth_on_cone(th, wx, wy, wz, dx, dy)
-    return _depth_on_quadric(th, wx, wy, wz, dx, dy)
+        return _roots(dd - da * da, dw - da * wa, ww - wa * wa - th[6] * th[6], th[7])
+    k = np.cos(th[6]) ** 2
+    return _root_on_cone(k * dd - da * da, k * dw - da * wa, k * ww - wa * wa, wa, da, th[7])
 
 
 @compiled
-def _depth_on_cone(th: Array, wx: float, wy: float, wz: float, dx: float, dy: float) -> float:
-    """Return the depth at which a ray meets a cone; w is its origin minus the apex, (dx, dy, 1) its direction."""
-    da = dx * th[3] + dy * th[4] + th[5]
-    wa = wx * th[3] + wy * th[4] + wz * th[5]
-    k = np.cos(th[6]) ** 2
-    a = k * (dx * dx + dy * dy + 1.0) - da * da
-    b = k * (dx * wx + dy * wy + wz) - da * wa
-    c = k * (wx * wx + wy * wy + wz * wz) - wa * wa
+def _root_on_cone(a: float, b: float, c: float, wa: float, da: float, side: float) -> float:
+    """Return the root of a z^2 + 2 b z + c that lies on the cone itself, where wa + z da > 0; NaN if none does."""
     disc = b * b - a * c
     if disc < 0.0 or abs(a) < 1e-15:
         return np.nan
@@ -103,7 +94,7 @@ def _depth_on_cone(th: Array, wx: float, wy: float, wz: float, dx: float, dy: fl
         near, far = far, near
     near_ok, far_ok = wa + near * da > 0.0, wa + far * da > 0.0
     if near_ok and far_ok:
-        return float(near if th[7] > 0 else far)
+        return float(near if side > 0 else far)
     if near_ok:
         return float(near)
     return far if far_ok else np.nan
@@ -112,37 +103,15 @@ def _depth_on_cone(th: Array, wx: float, wy: float, wz: float, dx: float, dy: fl
 @compiled
 def _depth_on_quadric(th: Array, wx: float, wy: float, wz: float, dx: float, dy: float) -> float:
     """Return the depth at which a ray meets a quadric; w is its origin minus the centre, (dx, dy, 1) its direction."""
-    inverse = 1.0 / th[3]
-    wx, wy, wz = wx * inverse, wy * inverse, wz * inverse
-    dx, dy, dz = dx * inverse, dy * inverse, inverse
-    a = th[4] * dx * dx + th[5] * dy * dy + th[6] * dz * dz + th[7] * dx * dy + th[8] * dx * dz + th[9] * dy * dz
-    b = (
-        th[4] * dx * wx
-        + th[5] * dy * wy
-        + th[6] * dz * wz
-        + 0.5
-        * (
-            th[7] * (dx * wy + dy * wx)
-            + th[8] * (dx * wz + dz * wx)
-            + th[9] * (dy * wz + dz * wy)
-            + th[10] * dx
-            + th[11] * dy
-            + th[12] * dz
-        )
-    )
-    c = (
-        th[4] * wx * wx
-        + th[5] * wy * wy
-        + th[6] * wz * wz
-        + th[7] * wx * wy
-        + th[8] * wx * wz
-        + th[9] * wy * wz
-        + th[10] * wx
-        + th[11] * wy
-        + th[12] * wz
-        + th[13]
-    )
-    return _roots(a, b, c, 1.0)
+    s = 1.0 / th[3]
+    wx, wy, wz, dx, dy, dz = wx * s, wy * s, wz * s, dx * s, dy * s, s
+    # u and v are half the gradients of the quadratic part at d and at w.
+    ux, vx = th[4] * dx + 0.5 * (th[7] * dy + th[8] * dz), th[4] * wx + 0.5 * (th[7] * wy + th[8] * wz)
+    uy, vy = th[5] * dy + 0.5 * (th[7] * dx + th[9] * dz), th[5] * wy + 0.5 * (th[7] * wx + th[9] * wz)
+    uz, vz = th[6] * dz + 0.5 * (th[8] * dx + th[9] * dy), th[6] * wz + 0.5 * (th[8] * wx + th[9] * wy)
+    b = ux * wx + uy * wy + uz * wz + 0.5 * (th[10] * dx + th[11] * dy + th[12] * dz)
+    c = (vx + th[10]) * wx + (vy + th[11]) * wy + (vz + th[12]) * wz + th[13]
+    return _roots(ux * dx + uy * dy + uz * dz, b, c, 1.0)
 
 
 @compiled

@@ -13,7 +13,7 @@ import numpy as np
 from hal.arrays import Array
 from hal.jit import as_numpy_scalar, compiled
 from perception.range.fitting.equations import MISS_SIGMAS, residuals
-from perception.range.fitting.fit import fit_robust
+from perception.range.fitting.fit import fit_robust, points_of
 from perception.range.fitting.initialisation import start_plane
 from perception.range.fitting.surfaces import CONE, CYLINDER, FREEDOM, PLANE, SIZE, normals_on
 from perception.range.segmentation.grid import slow_share_at
@@ -114,11 +114,10 @@ def _is_near(kind: int, th: Array, samples: Array, perspective: bool) -> bool:
 
 
 @compiled
-def _refined(kind: int, th: Array, s: Array, perspective: bool) -> tuple[Array, float]:
+def _refined(kind: int, th: Array, samples: Array, perspective: bool) -> tuple[Array, float]:
     """Return the parameters of a robust fit and the mean squared residual, each capped at the trim."""
-    free = np.zeros(9, np.bool_)
-    th, cost = fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, ROUNDS)
-    return th, cost / s.shape[1]
+    th, cost = fit_robust(kind, th, samples, perspective, ROUNDS)
+    return th, cost / samples.shape[1]
 
 
 @compiled
@@ -153,16 +152,6 @@ def turn_of(normals: Array) -> float:
 
 
 @compiled
-def points_of(samples: Array, perspective: bool) -> Array:
-    """Return the positions (N, 3) of the samples, metres."""
-    out = np.empty((samples.shape[1], 3))
-    for i in range(samples.shape[1]):
-        scale = samples[2, i] if perspective else 1.0
-        out[i, 0], out[i, 1], out[i, 2] = samples[0, i] * scale, samples[1, i] * scale, samples[2, i]
-    return out
-
-
-@compiled
 def surface_normals(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
     """Return the unit normals (N, 3) of the surface at the samples, turned towards the sensor."""
     normals = np.empty((samples.shape[1], 3))
@@ -173,8 +162,7 @@ def surface_normals(kind: int, th: Array, samples: Array, perspective: bool) -> 
 @compiled
 def residual_sizes(kind: int, th: Array, samples: Array, perspective: bool) -> Array:
     """Return the absolute residuals (N,) along the rays, in sigmas; `MISS_SIGMAS` for a ray that misses."""
-    e = np.empty(samples.shape[1])
-    residuals(kind, th, samples[0], samples[1], samples[2], samples[3], perspective, e)
+    e = residuals(kind, th, samples, perspective)
     for i in range(e.shape[0]):
         e[i] = abs(e[i]) if np.isfinite(e[i]) else MISS_SIGMAS
     return e

@@ -34,12 +34,12 @@ def mean_blocks(
     w = x.shape[1]
     hop = (b + BLOCK_SAMPLES - 1) // BLOCK_SAMPLES
     side = (b + hop - 1) // hop
-    work, values = np.empty(SCRATCH), np.empty(MOST_SAMPLES)
+    work = np.empty(SCRATCH)
     for r in range(top, bottom):
         for start in range(0, w, RUN):
             end = min(start + RUN, w)
             _load(depth, b, hop, side, r, start, end - start, work)
-            _medians(depth, b, hop, side, r, start, end - start, work, values)
+            _medians(side, end - start, work)
             work[M:SAMPLES] = 0.0
             if _is_any_known(end - start, work):
                 _sums(sen, noise, b, hop, side, end - start, work)
@@ -67,22 +67,12 @@ def _load(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int,
 
 
 @compiled
-def _medians(depth: Array, b: int, hop: int, side: int, r: int, start: int, n: int, work: Array, values: Array) -> None:
-    """Fill row MEDIAN: for blocks that lie inside the image from their four corner samples, else from all their samples."""
-    H, W = depth.shape
-    if side == 1:
-        for c in range(n):
-            work[MEDIAN + c] = work[SAMPLES + c]
-        return
-    whole = min(n, W // b - start) if hop == 1 and (r + 1) * b <= H else 0
-    _medians_of_four(side, whole, work)
-    for c in range(whole, n):
-        work[MEDIAN + c] = _median(side, c, work, values)
+def _medians(side: int, n: int, work: Array) -> None:
+    """Fill row MEDIAN with the lower medians of the corner samples of `n` blocks; missing readings sort last.
 
-
-@compiled
-def _medians_of_four(side: int, n: int, work: Array) -> None:
-    """Compute the lower medians of the corner samples of `n` blocks by a sorting network; missing readings sort last."""
+    The lower median is always a measured value, never a mean of two values on either side of a jump. It is NaN if only one
+    of the four is known.
+    """
     at_q, at_s = SAMPLES + (side - 1) * RUN, SAMPLES + side * (side - 1) * RUN
     at_t = SAMPLES + (side * side - 1) * RUN
     for c in range(n):
@@ -91,28 +81,9 @@ def _medians_of_four(side: int, n: int, work: Array) -> None:
         s, t = s if s == s else np.inf, t if t == t else np.inf  # noqa: PLR0124 - as above
         low_1, high_1, low_2, high_2 = min(p, q), max(p, q), min(s, t), max(s, t)
         second, third = min(max(low_1, low_2), high_1, high_2), max(low_1, low_2, min(high_1, high_2))
-        # The second of three or four readings, the first of two; NaN if there is only one.
+        # The second of three or four readings, the first of two.
         median = min(low_1, low_2) if third == np.inf else second
         work[MEDIAN + c] = median if second < np.inf else np.nan
-
-
-@compiled
-def _median(side: int, c: int, work: Array, values: Array) -> float:
-    """Return the lower median of a block's samples; NaN if most are missing.
-
-    The lower median is always a measured value, never a mean of two values on either side of a jump.
-    """
-    n = 0
-    for m in range(side * side):
-        d = work[SAMPLES + m * RUN + c]
-        if np.isfinite(d):
-            k = n  # insertion sort: at most 16 values
-            while k > 0 and values[k - 1] > d:
-                values[k] = values[k - 1]
-                k -= 1
-            values[k] = d
-            n += 1
-    return values[(n - 1) // 2] if n > 0 and 2 * n >= side * side else np.nan
 
 
 @compiled

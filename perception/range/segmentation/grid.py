@@ -8,13 +8,12 @@ depth of an orthographic sensor, so one linear fit serves both.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hal.arrays import Array
-from hal.jit import as_numpy_scalar, compiled
+from hal.jit import compiled
 from perception.range.noise import NoiseModel, valid_sample
 from perception.range.segmentation.blocks import JUMP_SLOPE, mean_blocks
 from perception.range.segmentation.tangents import tangent_planes
@@ -24,11 +23,10 @@ from perception.range.tiles import for_each_tile
 NORMAL_SIGMA_GOAL_RAD = 0.06  # tangent planes noisier than this are fitted over a wider window
 WIDEST_RADIUS = 3  # blocks
 LARGE_SIDE_PX = 1024  # shorter side of an image from which the size of blocks grows with the image
-MIDDLE_SAMPLES = as_numpy_scalar(1024)  # depths from which the median is estimated
+MIDDLE_SAMPLES = 1024  # depths from which the median is estimated
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Grid:
+class Grid(NamedTuple):
     """Blocks of an image and their tangent planes, as (h, w) arrays; NaN depth marks an empty block.
 
     Attributes:
@@ -37,7 +35,6 @@ class Grid:
         perspective: whether the sensor is a pinhole.
         x, y: mean ray coordinates, on the plane z = 1 (pinhole) or in metres (orthographic).
         z, sigma: mean depth and its standard deviation, metres.
-        count: number of samples averaged.
         normal: (h, w, 3) unit normal of the tangent plane, towards the sensor.
         rms: root mean square residual of the tangent plane, in sigmas.
         normal_sigma_rad: expected standard deviation of the normals.
@@ -50,7 +47,6 @@ class Grid:
     x: Array
     y: Array
     z: Array
-    count: NDArray[np.int32]
     sigma: Array
     normal: Array
     rms: Array
@@ -116,7 +112,8 @@ def build_grid(
         lambda a, b: mean_blocks(depth_m, packed, law, size_px, x, y, z, sigma, count, a, b), h, tiles, pool=pool
     )
     perspective = bool(packed[0] > 0)
-    middle = _middle_depth(z)
+    known = valid_sample(z, MIDDLE_SAMPLES)
+    middle = float(np.median(known)) if known.size else 1.0
     radius, slope_sigma = _radius(noise, sensor, middle, size_px)
     slope = jump_slope / packed[1] * size_px
     normal, rms = np.full((h, w, 3), np.nan), np.full((h, w), np.nan)
@@ -126,20 +123,8 @@ def build_grid(
         tiles,
         pool=pool,
     )
-    return Grid(
-        size_px=size_px,
-        radius=radius,
-        perspective=perspective,
-        x=x,
-        y=y,
-        z=z,
-        count=count,
-        sigma=sigma,
-        normal=normal,
-        rms=rms,
-        normal_sigma_rad=slope_sigma,
-        slow_share=noise.slow_share(middle),
-    )
+    share = noise.slow_share(middle)
+    return Grid(size_px, radius, perspective, x, y, z, sigma, normal, rms, slope_sigma, share)
 
 
 def seen_from(sensor: RangeSensorModel, corner_px: tuple[int, int]) -> Array:
@@ -158,13 +143,6 @@ def _radius(noise: NoiseModel, sensor: RangeSensorModel, depth_m: float, size_px
         if sigma <= NORMAL_SIGMA_GOAL_RAD:
             return radius, sigma
     return WIDEST_RADIUS, sigma
-
-
-@compiled
-def _middle_depth(z: Array) -> float:
-    """Return the median of a sample of the known depths in metres; 1 if there are none."""
-    known = valid_sample(z, MIDDLE_SAMPLES)
-    return np.median(known) if known.shape[0] > 0 else 1.0
 
 
 @compiled

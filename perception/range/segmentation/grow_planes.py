@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from hal.arrays import Array, Indices, Labels, Mask
-from hal.jit import as_numpy_scalar, compiled
+from hal.jit import compiled
 from perception.range.segmentation.flat_fit import is_bent, moved_rms, plane_from_coefficients, solve3, squares_left
+from perception.range.segmentation.grid import Grid
 from perception.range.segmentation.grow_surface import GROW_SIGMAS
 from perception.range.segmentation.tangents import STEADY_RMS
 
@@ -19,34 +20,31 @@ SAME_BLOCKS = 200  # sweeps end when the number of blocks changes by less than o
 SAME_PLANE = 0.1  # sigmas; sweeps end when the plane moves by less, as it then explains the same blocks
 MOST_PLANES = 512
 LOOSE_NORMAL = 0.5  # stored length of a normal that may seed a plane but is too noisy to be compared with one
-EMPTY = as_numpy_scalar(0)
 TAKEN = np.int32(2**31 - 1)  # mark of a block that belongs to a plane, or is not free
 BENT = np.int32(-1)  # owner of a block from which no plane grows, because it is curved
 
 
 @compiled
 def grow_planes(
-    x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask, label: Labels, first_label: int,
-    perspective: bool, order: Labels, least: int, cos_limit: float, tried: Mask,
+    grid: Grid, free: Mask, label: Labels, first_label: int, order: Indices, least: int, cos_limit: float,
 ) -> tuple[Array, Indices, Array]:  # fmt: skip
     """Grow planes over the free blocks; writes their labels, from `first_label` on, into `label` and updates `free`.
 
-    `x` to `rms` are the arrays of `Grid`. `order`: flat indices of the seeds, the best first. A plane needs `least` blocks,
-    and the normals of its blocks differ from its own by an angle whose cosine is at least `cos_limit`. Blocks of planes
-    that were rejected as curved are marked in `tried`.
+    `order`: flat indices of the seeds, the best first. A plane needs `least` blocks, and the normals of its blocks differ
+    from its own by an angle whose cosine is at least `cos_limit`.
 
     Returns parameters (M, 16), numbers of blocks (M,) and mean squared residuals (M,) of the planes.
     """
-    h, w = z.shape
-    table, mark, place = _padded(x, y, z, sigma, normal, rms, free, perspective)
-    across = w + 2
+    h, w = grid.z.shape
+    perspective, across = grid.perspective, w + 2
+    table, mark, place = _padded(grid, free)
     owner = np.zeros(table.shape[0], np.int32)  # label, or BENT
-    queue, spans = np.empty(h * w, np.int32), np.empty((h * w, 2), np.int32)
+    queue = np.empty(h * w, np.int32)
     ths, counts, mean2 = np.zeros((MOST_PLANES, 16)), np.zeros(MOST_PLANES, np.int64), np.zeros(MOST_PLANES)
     found, stamp = 0, 0
     m, S, th = np.zeros(3), np.zeros(9), np.zeros(16)
-    for o in range(order.shape[0]):
-        start = place[order[o]]
+    for seed in order:
+        start = place[seed]
         if mark[start] == TAKEN or owner[start] != 0 or found == MOST_PLANES:
             continue
         if not _tangent(table[start], perspective, m):
@@ -56,10 +54,7 @@ def grow_planes(
             plane_from_coefficients(m, perspective, th)
             before, a, b, c = count, m[0], m[1], m[2]
             stamp += 2
-            if sweep == 0:
-                count = _grown(table, mark, across, start, stamp, m, th, perspective, cos_limit, queue, S)
-            else:
-                count = _filled(table, mark, across, start, stamp, m, th, cos_limit, queue, spans, S)
+            count = _grown(table, mark, across, start, stamp, sweep > 0, m, th, perspective, cos_limit, queue, S)
             if count < least or not solve3(S, m):
                 count = 0
                 break
@@ -71,17 +66,16 @@ def grow_planes(
             continue
         plane_from_coefficients(m, perspective, th)
         flat, bent = _bend(queue, count, table, S)
-        for k in range(count):
-            owner[queue[k]] = BENT if bent else first_label + found
+        owner[queue[:count]] = BENT if bent else first_label + found
         if bent:
             continue
-        for k in range(count):
-            mark[queue[k]] = TAKEN
-        ths[found] = th
-        counts[found] = count
-        mean2[found] = flat / max(count - 3, 1)
+        mark[queue[:count]] = TAKEN
+        ths[found], counts[found], mean2[found] = th, count, flat / max(count - 3, 1)
         found += 1
-    _hand_over(owner, place, free.ravel(), label.ravel(), tried.ravel())
+    flat_free, flat_label = free.ravel(), label.ravel()
+    for i in range(place.shape[0]):
+        if owner[place[i]] > 0:
+            flat_label[i], flat_free[i] = owner[place[i]], False
     return ths[:found].copy(), counts[:found].copy(), mean2[:found].copy()
 
 
@@ -98,26 +92,13 @@ def _bend(queue: Labels, count: int, table: Array, S: Array) -> tuple[float, boo
 
 
 @compiled
-def _hand_over(owner: Labels, place: Labels, free: Mask, label: Labels, tried: Mask) -> None:
-    """Copy the owners from the padded table to the flat grid arrays `free`, `label` and `tried`."""
-    for i in range(place.shape[0]):
-        mine = owner[place[i]]
-        if mine > 0:
-            label[i], free[i] = mine, False
-        elif mine == BENT:
-            tried[i] = True
-
-
-@compiled
-def _padded(
-    x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask, perspective: bool,
-) -> tuple[Array, Labels, Labels]:  # fmt: skip
+def _padded(grid: Grid, free: Mask) -> tuple[Array, Labels, Labels]:
     """Copy the blocks into a table with a margin of taken ones, so that growing needs no test for the image border.
 
     Returns the table (N, 8) of x, y, g (1 / z or z), weight of g, normal (0 if unknown) and z; the marks (N,), `TAKEN`
     where a block is not free; and the row of the table for each block (h w,).
     """
-    h, w = z.shape
+    h, w = grid.z.shape
     across = w + 2
     table, mark = np.zeros(((h + 2) * across, 8)), np.full((h + 2) * across, TAKEN, np.int32)
     place = np.empty(h * w, np.int32)
@@ -127,16 +108,16 @@ def _padded(
             place[r * w + c] = i
             if not free[r, c]:
                 continue
-            d = z[r, c]
-            weight = (d * d if perspective else 1.0) / sigma[r, c]
+            d = grid.z[r, c]
+            weight = (d * d if grid.perspective else 1.0) / grid.sigma[r, c]
             mark[i] = 0
-            table[i, 0], table[i, 1], table[i, 2] = x[r, c], y[r, c], 1.0 / d if perspective else d
+            table[i, 0], table[i, 1], table[i, 2] = grid.x[r, c], grid.y[r, c], 1.0 / d if grid.perspective else d
             table[i, 3], table[i, 7] = weight * weight, d
-            if np.isfinite(rms[r, c]):
+            if np.isfinite(grid.rms[r, c]):
                 # The length of the normal encodes whether `_fits` compares it: noisy normals do not limit growth.
-                size = 1.0 if rms[r, c] < STEADY_RMS else LOOSE_NORMAL
+                size = 1.0 if grid.rms[r, c] < STEADY_RMS else LOOSE_NORMAL
                 for k in range(3):
-                    table[i, 4 + k] = size * normal[r, c, k]
+                    table[i, 4 + k] = size * grid.normal[r, c, k]
     return table, mark, place
 
 
@@ -182,13 +163,14 @@ def _fits(block: Array, a: float, b: float, c: float, th: Array, limit: float, c
 
 @compiled
 def _grown(
-    table: Array, mark: Labels, across: int, seed: int, stamp: int, m: Array, th: Array, perspective: bool,
-    cos_limit: float, queue: Labels, S: Array,
+    table: Array, mark: Labels, across: int, seed: int, stamp: int, is_fixed: bool, m: Array, th: Array,
+    perspective: bool, cos_limit: float, queue: Labels, S: Array,
 ) -> int:  # fmt: skip
     """Collect the blocks connected to `seed` that the plane explains into `queue`, nearest first; returns their number.
 
-    The plane g = m . (x, y, 1) is refitted as blocks are added, so they are added breadth first, from all sides.
-    `S` receives their sums in the form that `solve3` reads.
+    Unless it is fixed, the plane g = m . (x, y, 1) is refitted as blocks are added, so they are added breadth first, from
+    all sides. `S` receives their sums in the form that `solve3` reads. Blocks are marked `stamp`; those that a fixed plane
+    does not explain `stamp` - 1, so that each is tested once.
     """
     S[:] = 0.0
     queue[0] = seed
@@ -199,74 +181,20 @@ def _grown(
         i = queue[head]
         head += 1
         _add_block(table[i], S)
-        if head == refit_at:
+        if head == refit_at and not is_fixed:
             refit_at *= 2
             if solve3(S, m):
                 plane_from_coefficients(m, perspective, th)
                 a, b, c = m[0], m[1], m[2]
-        limit = (GROW_SIGMAS + 2.0 / np.sqrt(head)) ** 2
+        limit = (GROW_SIGMAS + (0.0 if is_fixed else 2.0 / np.sqrt(head))) ** 2
         for side in range(4):
             j = i + (across if side == 0 else -across if side == 1 else 1 if side == 2 else -1)
-            if mark[j] < stamp and _fits(table[j], a, b, c, th, limit, cos_limit):
+            if mark[j] >= stamp - 1:
+                continue
+            if _fits(table[j], a, b, c, th, limit, cos_limit):
                 mark[j] = stamp
                 queue[count] = j
                 count += 1
-    return count
-
-
-@compiled
-def _filled(
-    table: Array, mark: Labels, across: int, seed: int, stamp: int, m: Array, th: Array, cos_limit: float,
-    queue: Labels, spans: Labels, S: Array,
-) -> int:  # fmt: skip
-    """Collect all blocks connected to `seed` that the fixed plane g = m . (x, y, 1) explains, by scan-line filling.
-
-    Otherwise as `_grown`. Blocks that the plane does not explain are marked `stamp` - 1, so that each is tested once.
-    """
-    S[:] = 0.0
-    mark[seed] = stamp
-    count = _span(table, mark, seed, stamp, m, th, cos_limit, queue, EMPTY, spans[0], S)
-    found, head = 1, 0
-    while head < found:
-        left, right = spans[head]
-        head += 1
-        for step in (-across, across):
-            j, end = left + step, right + step
-            while j < end:
-                if mark[j] < stamp - 1:
-                    if _fits(table[j], m[0], m[1], m[2], th, GROW_SIGMAS * GROW_SIGMAS, cos_limit):
-                        mark[j] = stamp
-                        count = _span(table, mark, j, stamp, m, th, cos_limit, queue, count, spans[found], S)
-                        j = spans[found, 1]
-                        found += 1
-                    else:
-                        mark[j] = stamp - 1
-                j += 1
-    return count
-
-
-@compiled
-def _span(
-    table: Array, mark: Labels, at: int, stamp: int, m: Array, th: Array, cos_limit: float, queue: Labels, count: int,
-    span: Labels, S: Array,
-) -> int:  # fmt: skip
-    """Append the explained blocks of the row on both sides of block `at` to `queue`; writes their range into `span`.
-
-    The range is [first, end). Also adds the blocks to the sums `S`; returns the new length of `queue`.
-    """
-    a, b, c, limit = m[0], m[1], m[2], GROW_SIGMAS * GROW_SIGMAS
-    for step in (-1, 1):
-        j = at + step
-        while mark[j] < stamp - 1:
-            fits = _fits(table[j], a, b, c, th, limit, cos_limit)
-            mark[j] = stamp if fits else stamp - 1
-            if not fits:
-                break
-            j += step
-        span[0 if step < 0 else 1] = j
-    span[0] += 1
-    for i in range(span[0], span[1]):
-        queue[count] = i
-        count += 1
-        _add_block(table[i], S)
+            elif is_fixed:
+                mark[j] = stamp - 1
     return count

@@ -7,6 +7,7 @@ import numpy as np
 from hal.arrays import Array, Image, Indices, Mask
 from hal.jit import compiled
 from perception.range.fitting.surfaces import PLANE, depth_on, normal_on
+from perception.range.segmentation.grid import Grid
 from perception.range.segmentation.tangents import STEADY_RMS
 
 GROW_SIGMAS = 3.0  # largest residual of a block
@@ -14,40 +15,34 @@ GROW_SIGMAS = 3.0  # largest residual of a block
 
 @compiled
 def grow_surface(
-    kind: int, th: Array, x: Array, y: Array, z: Array, sigma: Array, normal: Array, rms: Array, free: Mask,
-    seeds: Indices, perspective: bool, cos_limit: float, mark: Image, stamp: int, queue: Indices,
+    kind: int, th: Array, grid: Grid, free: Mask, seeds: Indices, cos_limit: float, mark: Image, stamp: int,
+    queue: Indices,
 ) -> tuple[int, float]:  # fmt: skip
     """Collect the blocks connected to `seeds` that the surface explains into `queue`.
 
-    Returns their number and the sum of their squared residuals, in squared sigmas. `x` to `rms` are the arrays of `Grid`;
-    only blocks that are `free` count. `mark` receives `stamp` for each collected block.
+    Returns their number and the sum of their squared residuals, in squared sigmas. Only blocks that are `free` count.
+    `mark` receives `stamp` for each collected block.
     """
-    h, w = z.shape
-    fx, fy, fz, fs = x.ravel(), y.ravel(), z.ravel(), sigma.ravel()
-    ff, fr = free.ravel(), rms.ravel()
-    fn = normal.reshape(h * w, 3)
+    h, w = grid.z.shape
+    flat_free = free.ravel()
     count, head, total = 0, 0, 0.0
-    for k in range(seeds.shape[0]):
-        j = seeds[k]
-        e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn, j, fr[j], perspective, cos_limit)
-        if ff[j] and e2 >= 0.0 and mark[j] != stamp:
+    for j in seeds:
+        e2 = _explained(kind, th, grid, j, cos_limit)
+        if flat_free[j] and e2 >= 0.0 and mark[j] != stamp:
             mark[j] = stamp
             queue[count] = j
             count += 1
             total += e2
     while head < count:
-        i = queue[head]
+        r, c = queue[head] // w, queue[head] % w
         head += 1
-        r, c = i // w, i % w
-        for s in range(4):
-            rr = r + (1 if s == 0 else -1 if s == 1 else 0)
-            cc = c + (1 if s == 2 else -1 if s == 3 else 0)
+        for rr, cc in ((r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)):
             if rr < 0 or cc < 0 or rr >= h or cc >= w:
                 continue
             j = rr * w + cc
-            if mark[j] == stamp or not ff[j]:
+            if mark[j] == stamp or not flat_free[j]:
                 continue
-            e2 = _explained(kind, th, fx[j], fy[j], fz[j], fs[j], fn, j, fr[j], perspective, cos_limit)
+            e2 = _explained(kind, th, grid, j, cos_limit)
             if e2 < 0.0:
                 continue
             mark[j] = stamp
@@ -58,15 +53,14 @@ def grow_surface(
 
 
 @compiled
-def _explained(
-    kind: int, th: Array, x: float, y: float, z: float, sigma: float, normals: Array, j: int, rms: float,
-    perspective: bool, cos_limit: float,
-) -> float:  # fmt: skip
+def _explained(kind: int, th: Array, grid: Grid, j: int, cos_limit: float) -> float:
     """Return the squared residual of block j in squared sigmas, reduced at grazing rays; -1 if the surface fails there."""
+    r, c = j // grid.z.shape[1], j % grid.z.shape[1]
+    x, y, perspective = grid.x[r, c], grid.y[r, c], grid.perspective
     zm = depth_on(kind, th, x, y, perspective)
     if not np.isfinite(zm):
         return -1.0
-    e = (z - zm) / sigma
+    e = (grid.z[r, c] - zm) / grid.sigma[r, c]
     px, py = (x * zm, y * zm) if perspective else (x, y)
     nx, ny, nz = normal_on(kind, th, px, py, zm)
     facing = nx * x + ny * y + nz if perspective else nz
@@ -75,11 +69,9 @@ def _explained(
     limit = GROW_SIGMAS * min(3.0, max(1.0, 0.5 * reach / max(abs(facing), 1e-3)))
     if abs(e) > limit:
         return -1.0
-    if rms < STEADY_RMS and kind != PLANE:
-        turn = nx * normals[j, 0] + ny * normals[j, 1] + nz * normals[j, 2]
-        if facing > 0.0:
-            turn = -turn
-        if turn < cos_limit:
+    if grid.rms[r, c] < STEADY_RMS and kind != PLANE:
+        turn = nx * grid.normal[r, c, 0] + ny * grid.normal[r, c, 1] + nz * grid.normal[r, c, 2]
+        if (turn if facing <= 0.0 else -turn) < cos_limit:
             return -1.0
     e *= GROW_SIGMAS / limit
-    return e * e
+    return float(e * e)

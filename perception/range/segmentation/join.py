@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hal.arrays import Array, Indices, Labels, Mask
 from hal.jit import as_numpy_scalar, compiled
-from perception.range.fitting import fit
+from perception.range.fitting.equations import TRIM_SIGMAS
+from perception.range.fitting.fit import fit_robust
 from perception.range.fitting.surfaces import PLANE, depth_on
 from perception.range.segmentation import bend
 from perception.range.segmentation.grid import slow_share_at
@@ -31,6 +34,15 @@ TOUCHING_PX = 8  # pieces that are closer than this count as touching
 GROOVE_PX = 2  # a single pixel may be a gross error
 BEHIND_SHARE = 0.15  # if a larger share of the line is measured behind the surface, there is a gap and no occluder
 APART, SCRAP, JOINED = 0, 1, 2  # results of `related`
+
+
+class Piece(NamedTuple):
+    """A piece of a surface: kind and parameters (16,), (4, N) samples, and number of pixels."""
+
+    kind: int
+    th: Array
+    samples: Array
+    pixels: int
 
 
 def join_pieces(regions: Regions, kinds: list[int], parameters: list[Array]) -> list[int]:
@@ -61,77 +73,80 @@ def _joined(
 
     Piece k has `pixels[k]` pixels and the samples[:, starts[k] : starts[k + 1]]. `order`: pieces, largest first.
     """
-    perspective = sen[0] > 0
-    owner, before = np.arange(1, kinds.shape[0] + 1), ths.copy()
-    thin = [np.ascontiguousarray(samples[:, starts[k] : starts[k + 1]]) for k in range(kinds.shape[0])]
+    perspective, owner = sen[0] > 0, np.arange(1, kinds.shape[0] + 1)
+    pieces = [
+        Piece(kinds[k], ths[k].copy(), np.ascontiguousarray(samples[:, starts[k] : starts[k + 1]]), pixels[k])
+        for k in range(kinds.shape[0])
+    ]
     for position in range(order.shape[0]):
         big = order[position]
         if owner[big] != big + 1:
             continue
+        before = pieces[big]
         for small in order[position + 1 :]:
-            if owner[small] != small + 1 or not _passes_near(kinds[big], before[big], thin[small], perspective):
+            large, other = pieces[big], pieces[small]
+            if owner[small] != small + 1 or not _passes_near(before.kind, before.th, other.samples, perspective):
                 continue
-            verdict, joint = related(
-                kinds[big], ths[big], thin[big], pixels[big],
-                kinds[small], ths[small], thin[small], pixels[small], noise, perspective,
-            )  # fmt: skip
+            verdict, joint = related(large, other, noise, perspective)
             if verdict == APART:
                 continue
             if verdict == JOINED:
                 own = np.zeros(owner.shape[0] + 1, np.bool_)
                 own[1:] = (owner == big + 1) | (owner == small + 1)
-                if gap_between(depth, sen, noise, labels, own, kinds[big], joint, thin[big], thin[small]):
+                if gap_between(depth, sen, noise, labels, own, large.kind, joint, large.samples, other.samples):
                     continue
                 ths[big] = joint
-                thin[big] = np.concatenate((thin[big], thin[small]), 1)
+                both = np.concatenate((large.samples, other.samples), 1)
+                few = np.ascontiguousarray(both[:, :: (both.shape[1] - 1) // PAIR_SAMPLES + 1])
+                pieces[big] = Piece(large.kind, joint, few, large.pixels)
             owner[small] = big + 1
     return owner
 
 
 @compiled
-def related(
-    kind: int, th: Array, samples: Array, pixels: int, other_kind: int, other: Array, others: Array, other_pixels: int,
-    noise: Array, perspective: bool,
-) -> tuple[int, Array]:  # fmt: skip
+def related(large: Piece, small: Piece, noise: Array, perspective: bool) -> tuple[int, Array]:
     """Classify the relation of a smaller piece to a larger one: APART, SCRAP (a fragment of it) or JOINED (one surface).
 
-    The larger piece has kind, parameters and `samples` (4, N, as in `bend`); `other_kind`, `other` and `others` are those
-    of the smaller one. Also returns the parameters of the joint surface (JOINED) or of the larger piece.
+    Also returns the parameters of the joint surface (JOINED) or of the larger piece.
     """
-    if other_pixels <= SCRAP_SHARE * pixels and _is_scrap(
-        kind, th, other_kind, other, others, other_pixels, noise, perspective
-    ):
+    kind, th = large.kind, large.th
+    if small.pixels <= SCRAP_SHARE * large.pixels and _is_scrap(large, small, noise, perspective):
         return SCRAP, th
-    if kind == PLANE and other_kind == PLANE:
-        turn = th[0] * other[0] + th[1] * other[1] + th[2] * other[2]
-        if turn < np.cos(LARGEST_TURN_RAD):
+    if kind == PLANE and small.kind == PLANE and _are_turned(large, small):
+        return APART, th
+    both = np.concatenate((large.samples, small.samples), 1)
+    rough, _ = fit_robust(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, ROUGH_ROUNDS)
+    for piece in (small, large):  # the smaller piece first, because it fails more often
+        if _trimmed(kind, rough, piece.samples, perspective)[0] < ROUGH_SHARE:
             return APART, th
-    both = np.concatenate((samples, others), 1)
-    rough = _fitted(kind, th, np.ascontiguousarray(both[:, ::ROUGH_STRIDE]), perspective, ROUGH_ROUNDS)
-    for s in (others, samples):  # the smaller piece first, because it fails more often
-        if _trimmed(kind, rough, s, perspective)[0] < ROUGH_SHARE:
-            return APART, th
-    joint = _fitted(kind, th, both, perspective, ROUNDS)
+    joint, _ = fit_robust(kind, th, both, perspective, ROUNDS)
     # Slow noise distorts a piece, and the joint surface cannot follow the distortion: the limit grows accordingly.
-    own = max(_trimmed(kind, th, samples, perspective)[1], _trimmed(other_kind, other, others, perspective)[1])
+    own = 0.0
+    for piece in (small, large):
+        own = max(own, _trimmed(piece.kind, piece.th, piece.samples, perspective)[1])
     limit = JOINED_MEAN_SQUARE * (1.0 + slow_share_at(noise, np.median(both[2])) * max(own - 1.0, 0.0))
-    for s in (samples, others):
-        share, mean_square = _trimmed(kind, joint, s, perspective)
+    for piece in (small, large):
+        share, mean_square = _trimmed(kind, joint, piece.samples, perspective)
         if share < JOINED_SHARE or not mean_square <= limit:
             return APART, th
     return JOINED, joint
 
 
 @compiled
-def _is_scrap(
-    kind: int, th: Array, own_kind: int, own: Array, samples: Array, pixels: int, noise: Array, perspective: bool,
-) -> bool:  # fmt: skip
+def _are_turned(large: Piece, small: Piece) -> bool:
+    """Return whether the planes of two pieces differ in direction by more than `LARGEST_TURN_RAD`."""
+    return bool(
+        large.th[0] * small.th[0] + large.th[1] * small.th[1] + large.th[2] * small.th[2] < np.cos(LARGEST_TURN_RAD)
+    )
+
+
+@compiled
+def _is_scrap(large: Piece, small: Piece, noise: Array, perspective: bool) -> bool:
     """Return whether a small piece is so close to a large surface that it is only a dent in it or a part of its rim."""
-    if bend.scrap_gain(kind, th, own_kind, own, samples, float(pixels), noise, perspective) > 0.0:
+    kind, th, samples = large.kind, large.th, small.samples
+    if bend.scrap_gain(kind, th, small.kind, small.th, samples, float(small.pixels), noise, perspective) > 0.0:
         return True
-    if kind == PLANE and own_kind != PLANE:
-        return False
-    if kind == PLANE and th[0] * own[0] + th[1] * own[1] + th[2] * own[2] < np.cos(LARGEST_TURN_RAD):
+    if kind == PLANE and (small.kind != PLANE or _are_turned(large, small)):
         return False
     hit, near = 0, 0
     for i in range(samples.shape[1]):
@@ -144,23 +159,11 @@ def _is_scrap(
 
 
 @compiled
-def _fitted(kind: int, th: Array, s: Array, perspective: bool, rounds: int) -> Array:
-    """Return the parameters of a robust fit to samples (4, N) that starts at `th`."""
-    free = np.zeros(9, np.bool_)
-    th, _ = fit.fit_robust(kind, th, s[0], s[1], s[2], s[3], perspective, free, rounds)
-    return th
-
-
-@compiled
-def _trimmed(kind: int, th: Array, s: Array, perspective: bool) -> tuple[float, float]:
+def _trimmed(kind: int, th: Array, samples: Array, perspective: bool) -> tuple[float, float]:
     """Return the share of the samples with residuals below `TRIM_SIGMAS`, and their mean square in squared sigmas."""
-    e = bend.residual_sizes(kind, th, s, perspective)
-    kept, total = 0, 0.0
-    for i in range(e.shape[0]):
-        if e[i] < fit.TRIM_SIGMAS:
-            kept += 1
-            total += e[i] * e[i]
-    return kept / max(e.shape[0], 1), total / kept if kept else np.inf
+    e = bend.residual_sizes(kind, th, samples, perspective)
+    kept = e[e < TRIM_SIGMAS]
+    return float(kept.shape[0] / max(e.shape[0], 1)), float(np.mean(kept * kept)) if kept.shape[0] else np.inf
 
 
 @compiled
@@ -185,35 +188,19 @@ def gap_between(
     `a`, `b` (4, N) are samples of the pieces. `own` tells for each label whether it belongs to them; pixels of other
     labels between them may belong to a narrow groove.
     """
-    distance = np.full(a.shape[1], np.inf)
-    for n in range(b.shape[1]):
-        _lessen(a[0], a[1], b[0, n], b[1, n], distance)
+    distance, nearest = np.full(a.shape[1], np.inf), np.zeros(a.shape[1], np.int64)
+    for m in range(a.shape[1]):
+        for n in range(b.shape[1]):
+            square = (a[0, m] - b[0, n]) ** 2 + (a[1, m] - b[1, n]) ** 2
+            if square < distance[m]:
+                distance[m], nearest[m] = square, n
     slack = GAP_SIGMAS * np.median(a[3])
     lines = np.argsort(distance)[:SIGHT_LINES]
     gaps = 0
     for m in lines:
-        n = _first_at(distance[m], b[0], b[1], a[0, m], a[1, m])
+        n = nearest[m]
         gaps += _is_gap(depth, sen, noise, labels, own, kind, th, a[0, m], a[1, m], b[0, n], b[1, n], slack)
     return bool(2 * gaps > lines.shape[0])
-
-
-@compiled
-def _lessen(x: Array, y: Array, x0: float, y0: float, distance: Array) -> None:
-    """Lower the squared `distance` of each ray (x, y) from its nearest ray in another set if the ray (x0, y0) is nearer."""
-    for m in range(x.shape[0]):
-        dx, dy = x[m] - x0, y[m] - y0
-        d2 = dx * dx + dy * dy
-        distance[m] = d2 if d2 < distance[m] else distance[m]
-
-
-@compiled
-def _first_at(distance: float, x: Array, y: Array, x0: float, y0: float) -> int:
-    """Return the index of the first ray (x, y) whose squared distance from (x0, y0) is at most `distance`."""
-    for n in range(x.shape[0]):
-        dx, dy = x0 - x[n], y0 - y[n]
-        if dx * dx + dy * dy <= distance:
-            return n
-    return 0
 
 
 @compiled

@@ -253,36 +253,3 @@ def _agreed(label: Labels, v: int, u: int) -> int:
         if n >= 5:
             return int(k)
     return 0
-
-
-@compiled
-def bucket(label: Labels, count: int) -> tuple[Indices, Labels]:
-    """Group flat pixel indices by label: label k owns indices[starts[k] : starts[k + 1]]; starts is (count + 2,).
-
-    Unlabelled pixels (label 0) are left out.
-    """
-    flat = label.ravel()
-    n = flat.shape[0]
-    starts = np.zeros(count + 2, np.int64)
-    # Neighbours mostly have the same label, so counts are updated only where it changes.
-    own, first = np.int64(0), 0
-    for i in range(n):
-        if flat[i] != own:
-            starts[own + 1] += i - first
-            own, first = np.int64(flat[i]), i
-    starts[own + 1] += n - first
-    starts[1] = 0
-    for k in range(count + 1):
-        starts[k + 1] += starts[k]
-    place = starts.copy()
-    indices = np.empty(starts[count + 1], np.int32)
-    own, at = np.int64(0), 0
-    for i in range(n):
-        if flat[i] != own:
-            place[own] = at
-            own = np.int64(flat[i])
-            at = place[own]
-        if own > 0:
-            indices[at] = i
-            at += 1
-    return starts, indices

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.arrays import Array, Indices
-from hal.jit import REORDERED, compiled
+from hal.arrays import Array, Indices, Labels
+from hal.jit import compiled
+from perception.range.fitting.last_step import fill_variances
 from perception.range.segmentation.run_length import painted, places_of, runs_of
 
-Labels = NDArray[np.int32]
+CENTRED = 0.5  # shift of samples, so that positions are rounded to the nearest pixel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -30,9 +30,9 @@ class Regions:
     packed: Array
     law: Array
     labels: Labels
-    starts: NDArray[np.int64]
+    starts: Indices
     runs: Labels
-    sizes: NDArray[np.int64]
+    sizes: Indices
 
     @property
     def pixels(self) -> list[int]:
@@ -41,15 +41,14 @@ class Regions:
         return sizes
 
     def few(self, most: int) -> list[Array]:
-        """Return at most `most` samples of each label, spread evenly and deterministically over its pixels."""
-        sizes = np.minimum(self.sizes[1:], most).tolist()
-        return [np.ascontiguousarray(s[:, :n]) for s, n in zip(self.samples(most), sizes, strict=True)]
+        """Return the samples of all labels; entry 0 is label 1."""
+        return [self.sampled(label, most) for label in range(1, self.sizes.shape[0])]
 
-    def samples(self, most: int) -> Array:
-        """Return the samples of `few` as one array (count, 4, most); unset beyond the pixels of a small label."""
-        return np.asarray(
-            _spread_samples(self.depth_m, self.packed, self.law, self.starts, self.runs, self.sizes, most)
-        )
+    def sampled(self, label: int, most: int) -> Array:
+        """Return at most `most` samples (4, N) of a label, spread evenly and deterministically over its pixels."""
+        few = np.empty((4, min(int(self.sizes[label]), most)))
+        spread(self.depth_m, self.packed, self.law, self.runs_of(label), int(self.sizes[label]), CENTRED, few)
+        return few
 
     def runs_of(self, label: int) -> Labels:
         """Return the runs (R, 3) of a label in raster order: row, first column, and the column after the last."""
@@ -80,19 +79,6 @@ def regions_of(depth_m: Array, packed: Array, law: Array, labels: Labels, count:
 
 
 @compiled
-def _spread_samples(
-    depth: Array, sen: Array, noise: Array, starts: Indices, runs: Labels, sizes: Indices, most: int,
-) -> Array:  # fmt: skip
-    """Return samples (count, 4, most) of each label; entries beyond the number of a label's pixels are unset."""
-    count = sizes.shape[0] - 1
-    out = np.empty((count, 4, most))
-    for k in range(1, count + 1):
-        mine = runs[starts[k] : starts[k + 1]]
-        spread(depth, sen, noise, mine, sizes[k], 0.5, out[k - 1])
-    return out
-
-
-@compiled
 def spread(depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, shift: float, out: Array) -> None:
     """Fill `out` (4, n) with samples evenly spread over the `pixels` of runs (R, 3), offset by `shift` (0 to 1)."""
     n = min(out.shape[1], pixels)
@@ -105,14 +91,5 @@ def spread(depth: Array, sen: Array, noise: Array, runs: Labels, pixels: int, sh
             run += 1
         v, u = runs[run, 0], runs[run, 1] + at - passed
         out[0, j], out[1, j], out[2, j] = (u - sen[3]) / sen[1], (v - sen[4]) / sen[2], depth[v, u]
-    _fill_sigmas(out[2, :n], noise, out[3, :n])
-
-
-@compiled(fastmath=REORDERED)
-def _fill_sigmas(z: Array, noise: Array, out: Array) -> None:
-    """Write `sigma_at` of the depths z (N,) into `out` (N,), without a branch."""
-    a, b, c, d, e, f = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
-    for i in range(z.shape[0]):
-        z2 = z[i] * z[i]
-        white, slow, step = a + b * z2, c + d * z2, e + f * z2
-        out[i] = np.sqrt(max(white * white, step * step / 12.0) + slow * slow)
+    fill_variances(out[2, :n], noise, out[3, :n])
+    out[3, :n] = np.sqrt(out[3, :n])

@@ -83,17 +83,3 @@ def places_of(runs: Labels, width: int) -> Labels:
             out[n] = runs[i, 0] * width + u
             n += 1
     return out
-
-
-@compiled
-def pixels_of(labels: Labels, count: int) -> Indices:
-    """Count the pixels of each label 1 to `count`, (count + 1,); entry 0 counts the unlabelled pixels."""
-    W = labels.shape[1]
-    words, ends = np.zeros(W // WORD + 1, np.uint64), np.empty(W + 2, np.int32)
-    pixels = np.zeros(count + 1, np.int64)
-    for v in range(labels.shape[0]):
-        first = 0
-        for i in range(row_ends(labels[v], words, ends)):
-            pixels[labels[v, first]] += ends[i] - first
-            first = ends[i]
-    return pixels

@@ -4,83 +4,48 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.arrays import Array, Labels, Mask
+from hal.arrays import Image, Indices, Mask
 from hal.jit import compiled
+from perception.range.segmentation.grid import Grid
 
-LEVELS = 64  # levels of flatness in the counting sort
+LEVELS = 64  # levels of flatness
+NO_SEED = 255  # level of a block without a normal
 LONE_BEND = 0.02  # 1 - cosine of the angle that is assumed towards a neighbour without a normal
 
 
-@compiled
-def seed_order(normal: Array, rms: Array, free: Mask, reach: int) -> Labels:
-    """Return the flat indices of the free blocks with a tangent plane, flattest neighbourhood first (counting sort).
+def seed_order(grid: Grid, free: Mask, reach: int) -> Indices:
+    """Return the flat indices of the free blocks with a tangent plane, flattest neighbourhood first.
 
     Flatness is judged from the residual of the tangent plane and the angles to the normals `reach` blocks away on four
     sides.
     """
-    h, w = rms.shape
-    normals, known = _framed_normals(normal, rms, free, reach)
-    cosine, bend, levels = np.empty(w), np.empty(w), np.empty((h, w), np.int32)
-    starts = np.zeros(LEVELS + 1, np.int64)
-    for r in range(h):
-        if not known[r]:
-            continue
-        bend[:] = 0.0
-        for i, j in ((2 * reach, reach), (0, reach), (reach, 2 * reach), (reach, 0)):
-            cosine[:] = 0.0
-            for k in range(3):
-                _add_product(normals[k, r + reach, reach : reach + w], normals[k, r + i, j : j + w], cosine)
-            _add_bend(cosine, bend)
-        _fill_levels(bend, rms[r], normals[0, r + reach, reach : reach + w], levels[r])
-        for c in range(w):
-            if levels[r, c] >= 0:
-                starts[levels[r, c] + 1] += 1
-    for k in range(LEVELS):
-        starts[k + 1] += starts[k]
-    out = np.empty(starts[LEVELS], np.int32)
-    for r in range(h):
-        for c in range(w if known[r] else 0):
-            level = levels[r, c]
-            if level >= 0:
-                out[starts[level]] = r * w + c
-                starts[level] += 1
-    return out
+    levels = _levels(grid, free & np.isfinite(grid.rms), reach).ravel()
+    order = np.argsort(levels, kind="stable")  # of bytes, so it takes a time proportional to their number
+    return order[: np.count_nonzero(levels != NO_SEED)]
 
 
 @compiled
-def _framed_normals(normal: Array, rms: Array, free: Mask, reach: int) -> tuple[Array, Mask]:
-    """Return the normals of free blocks as (3, h + 2 reach, w + 2 reach), and which rows have any.
+def _levels(grid: Grid, known: Mask, reach: int) -> Image:
+    """Return the level (h, w) of each block: 0 for a flat neighbourhood with small residuals, more for others.
 
-    They are NaN where a block has no normal, and in the margin.
+    `known` (h, w): free blocks with a tangent plane; the others are no seeds.
     """
+    normal, rms = grid.normal, grid.rms
     h, w = rms.shape
-    out, known = np.full((3, h + 2 * reach, w + 2 * reach), np.nan), np.zeros(h, np.bool_)
+    levels = np.full((h, w), NO_SEED, np.uint8)
     for r in range(h):
         for c in range(w):
-            if free[r, c] and np.isfinite(rms[r, c]):
-                known[r] = True
-                for k in range(3):
-                    out[k, r + reach, c + reach] = normal[r, c, k]
-    return out, known
-
-
-@compiled
-def _add_product(a: Array, b: Array, out: Array) -> None:
-    """Add a * b to `out`, elementwise."""
-    for c in range(out.shape[0]):
-        out[c] += a[c] * b[c]
-
-
-@compiled
-def _add_bend(cosine: Array, bend: Array) -> None:
-    """Add the bend towards a neighbour: 1 - cosine of the angle between normals, `LONE_BEND` if one is NaN."""
-    for c in range(bend.shape[0]):
-        bend[c] += 1.0 - cosine[c] if cosine[c] == cosine[c] else LONE_BEND
-
-
-@compiled
-def _fill_levels(bend: Array, rms: Array, known: Array, levels: Labels) -> None:
-    """Fill `levels`: 0 for a flat neighbourhood with small residuals, more for others, and -1 for a block without a normal."""
-    for c in range(bend.shape[0]):
-        level = min(LEVELS - 1.0, 12.0 * np.sqrt(max(25.0 * bend[c], 0.0)) + 4.0 * max(rms[c] - 1.0, 0.0))
-        levels[c] = np.int32(level if known[c] == known[c] else -1.0)
+            if not known[r, c]:
+                continue
+            bend = 0.0
+            for i, j in ((r + reach, c), (r - reach, c), (r, c + reach), (r, c - reach)):
+                if 0 <= i < h and 0 <= j < w and known[i, j]:
+                    dot = 0.0
+                    for k in range(3):
+                        dot += normal[r, c, k] * normal[i, j, k]
+                    bend += 1.0 - dot
+                else:
+                    bend += LONE_BEND
+            level = 12.0 * np.sqrt(max(25.0 * bend, 0.0)) + 4.0 * max(rms[r, c] - 1.0, 0.0)
+            levels[r, c] = np.uint8(min(LEVELS - 1.0, level))
+    return levels

@@ -15,9 +15,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, Labels
 from perception.range.fitting.surfaces import PLANE
 from perception.range.noise import WORST_SHARE, NoiseModel
 from perception.range.segmentation.boundary_pixels import contested_pixels, pixels_around, renamed_pixels
@@ -30,8 +29,6 @@ from perception.range.segmentation.seeds import seed_order
 from perception.range.segmentation.unlabelled import unlabelled_patches
 from perception.range.sensor import RangeSensorModel
 from perception.range.tiles import for_each_tile
-
-Labels = NDArray[np.int32]
 
 LEAST_PIXELS_AT_256 = 32  # pixels of the smallest surface in an image of 256 x 256 pixels
 LEAST_FLAT_BLOCKS = 24  # a smaller flat patch may be a facet of a curved surface, so model selection decides about it
@@ -89,7 +86,7 @@ def segment(task: Task, noise: NoiseModel) -> tuple[Labels, Candidates, NoiseMod
     found, grid, blocks, noise = _planes_and_noise(task, noise)
     size = grid.size_px
     least = max(LEAST_CURVED_BLOCKS if size > 1 else 6, round(task.least_pixels / size**2))
-    select_models(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
+    select_models(grid, blocks, found=found, least=least, slope_per_px=STEEP_SLOPE / float(task.packed[1]))
     labels = _assign_all_pixels(task, noise, blocks, found, size=size)
     if size > 1:
         labels = _add_small_surfaces(task, noise, labels, found, size=(size + 1) // 2)
@@ -129,7 +126,7 @@ def _add_small_surfaces(task: Task, noise: NoiseModel, labels: Labels, found: Ca
     blocks = np.zeros(grid.z.shape, np.int32)
     before = len(found.kinds)
     _recover_planes(part, grid, blocks, found)
-    select_models(grid, blocks, found=found, least=least, slope=STEEP_SLOPE, focal_px=float(task.packed[1]))
+    select_models(grid, blocks, found=found, least=least, slope_per_px=STEEP_SLOPE / float(task.packed[1]))
     if len(found.kinds) == before:
         return labels
     inside = labels[top : top + left_over.shape[0], left : left + left_over.shape[1]]
@@ -204,24 +201,8 @@ def _recover_planes(task: Task, grid: Grid, blocks: Labels, found: Candidates) -
     free = np.isfinite(grid.z) & (blocks == 0)
     least = max(LEAST_FLAT_BLOCKS, round(task.least_pixels / grid.size_px**2))
     cos_limit = float(np.cos(max(0.26, 4.0 * grid.normal_sigma_rad)))
-    tried = np.zeros(free.shape, np.bool_)
-    order = seed_order(grid.normal, grid.rms, free, grid.radius + 1)
-    planes, counts, mean2 = grow_planes(
-        grid.x,
-        grid.y,
-        grid.z,
-        grid.sigma,
-        grid.normal,
-        grid.rms,
-        free,
-        blocks,
-        len(found.kinds) + 1,
-        grid.perspective,
-        order,
-        least,
-        cos_limit,
-        tried,
-    )
+    order = seed_order(grid, free, grid.radius + 1)
+    planes, counts, mean2 = grow_planes(grid, free, blocks, len(found.kinds) + 1, order, least, cos_limit)
     for th in planes:
         found.add(PLANE, th)
     large = counts >= LARGE_PLANE_BLOCKS

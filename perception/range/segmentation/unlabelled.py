@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.arrays import Array, Indices
+from hal.arrays import Array, Indices, Labels
 from hal.jit import compiled
 from hal.union_find import find, unite
 from perception.range.segmentation.boundary_pixels import WORD
 from perception.range.segmentation.run_length import row_ends
-
-Labels = NDArray[np.int32]
 
 
 def unlabelled_patches(

@@ -39,12 +39,13 @@ def grids():
 
 
 @grids()
-def test_a_block_is_the_mean_of_what_lies_near_its_median(sensor, size):
+def test_a_block_is_the_mean_of_what_lies_near_the_median_of_its_corners(sensor, size):
     depth = depth_with_a_jump_and_holes()
     grid, packed = build_grid(depth, sensor, NOISE, size), seen_from(sensor, (0, 0))
     hop = -(-size // BLOCK_SAMPLES)
     places = range(0, size, hop)
-    least = len(places) ** 2 / 2
+    least, corners = len(places) ** 2 / 2, np.array([0, places[-1]])
+    wide = np.pad(depth, ((0, size), (0, size)), constant_values=np.nan)
     h, w = grid.z.shape
     rng = np.random.default_rng(0)
     some = zip(rng.integers(0, h, 250).tolist(), rng.integers(0, w, 250).tolist(), strict=True)
@@ -52,11 +53,9 @@ def test_a_block_is_the_mean_of_what_lies_near_its_median(sensor, size):
         rows, columns = (at[(at < n)] for at, n in zip(
             (r * size + np.array(places), c * size + np.array(places)), SHAPE, strict=True
         ))  # fmt: skip
-        whole = len(rows) == len(columns) == len(places)
-        corners = whole and 1 < size <= BLOCK_SAMPLES
-        part = depth[np.ix_(rows[[0, -1]], columns[[0, -1]])] if corners else depth[np.ix_(rows, columns)]
+        part = wide[np.ix_(r * size + corners, c * size + corners)]
         known = np.sort(part[np.isfinite(part)])
-        if known.size < 2 if corners else known.size < least:
+        if known.size < 2:
             assert np.isnan(grid.z[r, c]) and np.isnan(grid.sigma[r, c])
             continue
         median, sigma = known[(known.size - 1) // 2], float(NOISE.sigma_m(known[(known.size - 1) // 2]))
@@ -116,17 +115,14 @@ def test_seeds_come_flattest_first_and_in_raster_order_where_equally_flat():
     seeds = np.flatnonzero(np.isfinite(framed[reach:-reach, reach:-reach, 0]))
     expected = seeds[np.argsort(level.ravel()[seeds].astype(int), kind="stable")]
     assert expected.size > 100
-    np.testing.assert_array_equal(seed_order(grid.normal, grid.rms, free, reach), expected)
+    np.testing.assert_array_equal(seed_order(grid, free, reach), expected)
 
 
-def test_a_span_fill_finds_the_blocks_that_growth_by_neighbours_finds():
-    """With a fixed plane, both ways of growing give the component of explained blocks around the seed."""
+def test_a_fixed_plane_grows_over_the_connected_blocks_that_it_explains():
     grid = build_grid(depth_with_a_jump_and_holes(), SENSORS[1], NOISE, 1)
     h, w = grid.z.shape
     free = np.isfinite(grid.z)
-    table, mark, place = grow._padded(
-        grid.x, grid.y, grid.z, grid.sigma, grid.normal, grid.rms, free, grid.perspective
-    )  # fmt: skip
+    table, mark, place = grow._padded(grid, free)
     rows = table[place].reshape(h, w, 8)
     a, b, c = np.linalg.lstsq(np.stack([*rows[:, :30, :2][free[:, :30]].T, np.ones(free[:, :30].sum())], 1),
                               rows[:, :30, 2][free[:, :30]], rcond=None)[0]  # fmt: skip
@@ -137,8 +133,8 @@ def test_a_span_fill_finds_the_blocks_that_growth_by_neighbours_finds():
     explained = free & (np.abs(e) <= grow.GROW_SIGMAS) & ((rows[..., 4:7] @ th[:3] >= cos_limit) | (length**2 <= 0.5))
     parts, _ = label(explained)
     seed = int(np.flatnonzero(parts.ravel() == np.argmax(np.bincount(parts[explained])))[0])
-    queue, spans, S = np.empty(h * w, np.int32), np.empty((h * w, 2), np.int32), np.zeros(9)
-    count = grow._filled(table, mark, w + 2, place[seed], 2, m, th, cos_limit, queue, spans, S)
+    queue, S = np.empty(h * w, np.int32), np.zeros(9)
+    count = grow._grown(table, mark, w + 2, place[seed], 2, True, m, th, grid.perspective, cos_limit, queue, S)
     expected = np.flatnonzero(parts.ravel() == parts.ravel()[seed])
     assert count > 200
     np.testing.assert_array_equal(np.sort(queue[:count]), np.sort(place[expected]))

@@ -70,7 +70,7 @@ def test_each_ray_is_as_the_plain_function_has_it(kind, perspective):
         x, y = random_rays(perspective, 100, rng)
         z, cosine, J, frame = plain_rows(kind, th, x, y, perspective)
         work = np.zeros(rays.SCRATCH)
-        rays.load_rows(x, y, x, y, 0, 100, work)
+        rays.load_rows(np.stack([x, y, x, y]), work)
         rays.fill_rows(kind, th, frame, 100, perspective, work)
         depth, cosine_row = work[rays.DEPTH :][:100], work[rays.COSINE :][:100]
         np.testing.assert_array_equal(np.isnan(depth), np.isnan(z))
@@ -82,11 +82,21 @@ def test_each_ray_is_as_the_plain_function_has_it(kind, perspective):
             np.testing.assert_allclose(derivative[seen], J[seen, column], rtol=1e-6, atol=1e-9)
 
 
+def system_of(kind, th, frame, samples, perspective, scale, *, step_follows=True, work=None):
+    """Return cost, number of samples used, matrix and gradient of the compiled sums."""
+    n, work = samples.shape[1], np.empty(rays.SCRATCH) if work is None else work
+    H, g = np.zeros((9, 9)), np.zeros(9)
+    rays.load_rows(samples, work)
+    rays.fill_rows(kind, th, frame, n, perspective, work)
+    cost, used = equations.add_equations(kind, n, scale, work, H, g, step_follows)
+    return cost, used, H, g
+
+
 @pytest.mark.parametrize("perspective", [True, False], ids=["pinhole", "orthographic"])
 @pytest.mark.parametrize("scale", [0.0, 1.5])
 @pytest.mark.parametrize("kind", KINDS)
 def test_sums_are_those_of_numpy(kind, scale, perspective):
-    """300 samples are two full chunks and a part; some have gross errors, and some rays miss."""
+    """Some of the samples have gross errors, and some rays miss."""
     rng = np.random.default_rng(10 + kind)
     th = random_surface(kind, rng)
     x, y = random_rays(perspective, 300, rng)
@@ -94,10 +104,10 @@ def test_sums_are_those_of_numpy(kind, scale, perspective):
     sigma = rng.uniform(0.5e-3, 2e-3, 300)
     z = np.nan_to_num(truth, nan=0.6) + sigma * rng.normal(size=300)
     z[::17] += 0.05
-    H, g = np.ones((9, 9)), np.ones(9)
-    given = (kind, th, frame, x, y, z, sigma, perspective, scale, 3.0, H, g, np.empty(rays.SCRATCH), rays.NOTHING)
-    assert equations.normal_equations(*given, False) == equations.normal_equations(*given, True)
-    cost, used = equations.normal_equations(*given, True)
+    given = (kind, th, frame, np.stack([x, y, z, sigma]), perspective, scale)
+    cost, used, H, g = system_of(*given)
+    *figures, untouched, _ = system_of(*given, step_follows=False)
+    assert figures == [cost, used] and not untouched.any()
 
     hit = np.isfinite(truth)
     w = np.where(hit, np.minimum(1.0, cosine / GRAZING_COSINE) / sigma, 0.0)
@@ -110,7 +120,7 @@ def test_sums_are_those_of_numpy(kind, scale, perspective):
         wanted_cost = np.minimum(e**2, 9.0).sum()
     Jw = np.where(hit[:, None], J, 0.0) * w[:, None]
     p = FREEDOM[kind]
-    wanted = (Jw * weight[:, None]).T @ Jw
+    wanted = np.tril((Jw * weight[:, None]).T @ Jw)
     assert cost == pytest.approx(wanted_cost, rel=1e-9)
     assert used == np.count_nonzero(weight)
     np.testing.assert_allclose(H[:p, :p], wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
@@ -121,10 +131,8 @@ def test_sums_are_those_of_numpy(kind, scale, perspective):
 def test_residuals_are_in_sigmas_and_nan_where_a_ray_misses():
     th = np.zeros(SIZE)
     th[:5] = [0.0, 0.0, 0.6, 0.1, 1.0]
-    x, y, z = np.array([0.0, 0.0, 0.5]), np.zeros(3), np.array([0.5, 0.502, 0.6])
-    out = np.empty(3)
-    equations.residuals(SPHERE, th, x, y, z, np.full(3, 1e-3), True, out)
-    np.testing.assert_allclose(out, [0.0, 2.0, np.nan], atol=1e-9)
+    samples = np.stack([[0.0, 0.0, 0.5], np.zeros(3), [0.5, 0.502, 0.6], np.full(3, 1e-3)])
+    np.testing.assert_allclose(equations.residuals(SPHERE, th, samples, True), [0.0, 2.0, np.nan], atol=1e-9)
 
 
 def test_sums_do_not_depend_on_where_the_samples_lie_in_memory():
@@ -136,14 +144,11 @@ def test_sums_do_not_depend_on_where_the_samples_lie_in_memory():
     x, y = random_rays(False, count, rng)
     samples = np.stack([x, y, 0.6 + 0.05 * rng.normal(size=count), np.full(count, 0.03)])
     seen = set()
-    for place in range(5):
-        pool = np.zeros(4 * count + rays.SCRATCH)
-        parts = [pool[k * count : (k + 1) * count] for k in range(place)]
-        parts += [pool[k * count + rays.SCRATCH : (k + 1) * count + rays.SCRATCH] for k in range(place, 4)]
-        work = pool[place * count : place * count + rays.SCRATCH]
-        for part, values in zip(parts, samples, strict=True):
-            part[:] = values
-        H, g = np.zeros((9, 9)), np.zeros(9)
-        cost, _ = equations.normal_equations(SPHERE, th, frame, *parts, False, 0.0, 3.0, H, g, work, rays.NOTHING, True)
+    for first, apart in ((0, 0), (0, 3), (rays.SCRATCH, 0), (rays.SCRATCH + 1, 0)):
+        pool = np.zeros(4 * count + rays.SCRATCH + 3)
+        held = pool[first : first + 4 * count].reshape(4, count)
+        held[:] = samples
+        at = 4 * count + apart if first == 0 else 0
+        cost, _, H, g = system_of(SPHERE, th, frame, held, False, 0.0, work=pool[at : at + rays.SCRATCH])
         seen.add((cost, H.tobytes(), g.tobytes()))
     assert len(seen) == 1

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from perception.range.segmentation.borders import PAIR_POINTS, WIDEST_GAP_PX, touching
-from perception.range.segmentation.pixel_assignment import bucket
 from perception.range.segmentation.unlabelled import unlabelled_patches
 
 PACKED = np.array([1.0, 100.0, 120.0, 7.5, 4.0])
@@ -56,15 +55,6 @@ def test_borders_are_the_contacts_of_every_pair_evenly_spread(seed):
 def test_one_region_has_no_border():
     assert touching(np.ones((5, 6), np.int32), PACKED)[0].shape == (0, 2)
     assert touching(np.zeros((5, 6), np.int32), PACKED)[0].shape == (0, 2)
-
-
-def test_a_bucket_holds_the_pixels_of_its_label_in_raster_order():
-    labels = patchwork(3)
-    starts, indices = bucket(labels, 90)
-    assert starts[1] == 0
-    assert starts[-1] == indices.size == np.count_nonzero(labels)
-    for label in range(1, 91):
-        np.testing.assert_array_equal(indices[starts[label] : starts[label + 1]], np.flatnonzero(labels == label))
 
 
 @pytest.mark.parametrize("seed", range(4))

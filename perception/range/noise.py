@@ -21,6 +21,7 @@ from perception.range.sensor import RangeSensorModel
 
 WINDOW = 5  # samples along a window; a window of 25 samples rarely holds a gross error
 BASIS = quadratics(WINDOW)
+WINDOWS_ACROSS = 30  # of the small windows, along the shorter side of a large image
 LARGE_SHARE = 1 / 60  # spacing of the large window's samples, as a ratio of the shorter side; at least 2 pixels
 QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above this quantile in all but the busiest scenes
 WORST_SHARE = 0.03  # of the depth: an image that scatters more shows no surface, and no model may explain it as one
@@ -67,10 +68,7 @@ class NoiseModel:
 
     def scaled(self, factor: float) -> NoiseModel:
         """Return this model with every part multiplied by `factor`."""
-        if factor == 1.0:
-            return self
-        parts = ((factor * a, factor * b) for a, b in (self.white, self.correlated, self.step))
-        white, correlated, step = parts
+        white, correlated, step = ((factor * a, factor * b) for a, b in (self.white, self.correlated, self.step))
         return NoiseModel(white=white, correlated=correlated, step=step)
 
     def widened(self, factor: float, depths_m: Array) -> NoiseModel:
@@ -100,7 +98,7 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel, *, depths_m: Array 
     g = 1.0 / depth_m if perspective else depth_m
     z2 = (typical_depths_m(depth_m) if depths_m is None else depths_m) ** 2
     floor = np.array([FLOOR_RATIO * sensor.pitch_m(float(z)) for z in np.sqrt(z2)])
-    small = _window_law(g, perspective, spacing_px=1, stride_px=7)
+    small = _window_law(g, perspective, spacing_px=1, stride_px=max(7, min(g.shape) // WINDOWS_ACROSS))
     spacing = max(2, round(LARGE_SHARE * min(g.shape)))
     large = _window_law(g, perspective, spacing_px=spacing, stride_px=2 * spacing)
     step = coding_step(depth_m)
@@ -139,24 +137,12 @@ def typical_depths_m(depth_m: Array) -> Array:
     return np.asarray(sample[(np.array([0.1, 0.3, 0.5, 0.7, 0.9]) * (sample.size - 1)).astype(int)], float)
 
 
-@compiled
 def valid_sample(depth: Array, most: int) -> Array:
-    """Return every n-th of the valid depths in raster order, with n such that about `most` remain."""
+    """Return about `most` of the valid depths, evenly spread in raster order; all of them if most readings are missing."""
     flat = depth.ravel()
-    valid = 0
-    for i in range(flat.shape[0]):
-        valid += 1 if np.isfinite(flat[i]) else 0
-    stride = max(1, valid // most)
-    if valid == flat.shape[0]:
-        return flat[::stride].copy()
-    out = np.empty((valid + stride - 1) // stride)
-    seen = 0
-    for i in range(flat.shape[0]):
-        if np.isfinite(flat[i]):
-            if seen % stride == 0:
-                out[seen // stride] = flat[i]
-            seen += 1
-    return out
+    few = flat[:: max(1, flat.size // most)]
+    known = few[np.isfinite(few)]
+    return known if 4 * known.size > most else flat[np.isfinite(flat)]
 
 
 def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int) -> tuple[float, float]:
@@ -167,7 +153,7 @@ def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int)
     if min(g.shape) <= (WINDOW - 1) * spacing_px:
         return 0.0, 0.0
     freedom = WINDOW * WINDOW - BASIS.shape[0]
-    z, _, rms = window_rms(g, BASIS, BASIS.shape[0], spacing_px, stride_px, perspective)
+    z, _, rms = window_rms(g, BASIS, 3, spacing_px=spacing_px, stride_px=stride_px, perspective=perspective)
     if z.size == 0:
         return 0.0, 0.0
     rms *= WINDOW / np.sqrt(freedom)
@@ -177,28 +163,17 @@ def _window_law(g: Array, perspective: bool, *, spacing_px: int, stride_px: int)
     ends = np.arange(bins + 1) * z.size // bins
     # rms^2 freedom / sigma^2 is chi-square: Wilson and Hilferty's quantile removes the bias of looking low.
     expected = (1.0 - 2.0 / (9.0 * freedom) + NORMAL_QUANTILE * np.sqrt(2.0 / (9.0 * freedom))) ** 1.5
-    low = np.array([_low_quantile(rms[a:b]) for a, b in pairwise(ends.tolist())]) / expected
+    low = np.array([np.sort(rms[a:b])[int(QUANTILE * (b - a))] for a, b in pairwise(ends.tolist())]) / expected
     at = np.add.reduceat(z, ends[:-1]) / np.diff(ends)
     return _fit_law(at**2, low)
 
 
-def _low_quantile(values: Array) -> float:
-    """Return the quantile `QUANTILE` of the values (N,)."""
-    k = int(QUANTILE * values.size)
-    return float(np.partition(values, k)[k])
-
-
-def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
-    """Fit the law `a + b z^2` with a, b >= 0 to values at squared depths `z2`; returns `(a, b)`."""
-    a, b = _law_through(z2, values)
-    return float(a), float(b)
-
-
 @compiled
-def _law_through(z2: Array, values: Array) -> tuple[float, float]:
-    """Compute `_fit_law`, robust to depths at which no window is free of edges.
+def _fit_law(z2: Array, values: Array) -> tuple[float, float]:
+    """Fit the law `a + b z^2` with a, b >= 0 to values at squared depths `z2`; returns `(a, b)`.
 
-    Residuals are weighted by the inverse of the values, because relative errors count.
+    It is robust to depths at which no window is free of edges. Residuals are weighted by the inverse of the values,
+    because relative errors count.
     """
     typical = float(np.median(values))
     if typical <= 0.0:

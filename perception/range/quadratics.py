@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from hal.arrays import Array
-from hal.jit import compiled
 
 
 def quadratics(side: int) -> Array:
@@ -17,86 +17,29 @@ def quadratics(side: int) -> Array:
     return np.ascontiguousarray(q.T)
 
 
-@compiled
 def window_rms(
-    g: Array, basis: Array, first: int, spacing: int, stride: int, perspective: bool,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    g: Array, basis: Array, first: int, *, spacing_px: int, stride_px: int, perspective: bool
+) -> tuple[Array, Array, Array]:
     """Return depth and residuals of each window without missing samples, three arrays (N,) in metres.
 
     These are the depth at the middle of the window, the rms residual after a fit of the first `first` polynomials of
     `basis` (see `quadratics`), and the rms residual after a fit of all of them.
 
     Args:
-        g: (H, W) 1 / depth (`perspective`) or depth.
-        spacing: distance of neighbouring samples of a window in pixels.
-        stride: distance of neighbouring windows in pixels.
+        g: (H, W) 1 / depth (`perspective`) or depth; not smaller than a window.
+        spacing_px: distance of neighbouring samples of a window.
+        stride_px: distance of neighbouring windows.
     """
-    H, W = g.shape
-    side = int(np.sqrt(basis.shape[1]) + 0.5)
-    extent = (side - 1) * spacing + 1
-    count = ((H - extent) // stride + 1) * ((W - extent) // stride + 1)
-    z_out, first_out, rms_out = np.empty(count), np.empty(count), np.empty(count)
-    across = max((W - extent) // stride + 1, 0)
-    values, total, dot = np.empty((side * side, across)), np.empty(across), np.empty(across)
-    some = np.empty(across)
-    n = 0
-    for top in range(0, H - extent + 1, stride):
-        middle = g[top + extent // 2, extent // 2 :: stride]
-        _squares_left(g[top:], middle, basis, first, spacing, stride, values, dot, some, total)
-        for c in range(across):
-            if not np.isfinite(total[c]):
-                continue
-            z = 1.0 / middle[c] if perspective else middle[c]
-            z_out[n] = z
-            flat, rms = np.sqrt(max(some[c], 0.0)) / side, np.sqrt(max(total[c], 0.0)) / side
-            first_out[n] = flat * z * z if perspective else flat  # dz = z^2 dw
-            rms_out[n] = rms * z * z if perspective else rms
-            n += 1
-    return z_out[:n], first_out[:n], rms_out[:n]
-
-
-@compiled
-def _squares_left(
-    g: Array, middle: Array, basis: Array, first: int, spacing: int, stride: int, values: Array, dot: Array,
-    some: Array, total: Array,
-) -> None:  # fmt: skip
-    """Compute the residual sums of squares of all windows that begin in the first row of `g`.
-
-    Writes those after a fit of the first polynomials into `some`, and after a fit of all into `total`. The windows of a
-    row are processed together, so that the loops have no branch.
-    """
-    side = int(np.sqrt(basis.shape[1]) + 0.5)
-    total[:] = 0.0
-    for k in range(side * side):
-        _load_sample(g[k // side * spacing, k % side * spacing :: stride], middle, values[k], total)
-    for m in range(basis.shape[0]):
-        dot[:] = 0.0
-        for k in range(side * side):
-            _add_multiple(basis[m, k], values[k], dot)
-        _subtract_square(dot, total)
-        if m == first - 1:
-            for c in range(total.shape[0]):
-                some[c] = total[c]
-
-
-@compiled
-def _load_sample(samples: Array, middle: Array, values: Array, total: Array) -> None:
-    """Write one sample of each window, relative to its middle, into `values`, and add its square to `total`."""
-    for c in range(values.shape[0]):
-        value = samples[c] - middle[c]
-        values[c] = value
-        total[c] += value * value
-
-
-@compiled
-def _add_multiple(factor: float, values: Array, out: Array) -> None:
-    """Add `factor` times `values` to `out`."""
-    for c in range(out.shape[0]):
-        out[c] += factor * values[c]
-
-
-@compiled
-def _subtract_square(values: Array, out: Array) -> None:
-    """Subtract the squares of `values` from `out`."""
-    for c in range(out.shape[0]):
-        out[c] -= values[c] * values[c]
+    samples = basis.shape[1]
+    side = round(samples**0.5)
+    extent = (side - 1) * spacing_px + 1
+    windows = sliding_window_view(g, (extent, extent))[::stride_px, ::stride_px, ::spacing_px, ::spacing_px]
+    values = windows.reshape(-1, samples)
+    middle = values[:, samples // 2]
+    off = values - middle[:, None]
+    total, explained = np.einsum("ij,ij->i", off, off), (off @ basis.T) ** 2
+    known = np.isfinite(total)
+    z = 1.0 / middle[known] if perspective else middle[known]
+    scale = (z * z if perspective else 1.0) / side  # dz = z^2 dw
+    some, left = total - explained[:, :first] @ np.ones(first), total - explained @ np.ones(len(basis))
+    return z, np.sqrt(np.maximum(some[known], 0.0)) * scale, np.sqrt(np.maximum(left[known], 0.0)) * scale

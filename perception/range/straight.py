@@ -62,6 +62,6 @@ def _bends(g: Array, is_inverse: bool) -> Array:
     """
     if min(g.shape) < SIDE:
         return np.zeros(0)
-    z, flat, bent = window_rms(g, BASIS, 3, 1, SIDE // 2, is_inverse)
+    z, flat, bent = window_rms(g, BASIS, 3, spacing_px=1, stride_px=SIDE // 2, perspective=is_inverse)
     floor = (PRECISION * z) ** 2
     return np.asarray(0.5 * SIDE * SIDE * np.log((flat**2 + floor) / (bent**2 + floor)))

@@ -26,7 +26,6 @@ TURN_RAD = 1.0  # a surface fitted to several rounded edges may meet its faces a
 FLAT_TURN_RAD = 0.5  # a flat strip at a larger angle to its face is a bevel
 # Half width, as a ratio of the image's shorter side, below which a strip's own shape is unknown; the step then accepted.
 NARROW, NARROW_SIGMAS = 0.004, 4.0
-GENTLE_RAD = 0.7  # a strip that touches only one face must meet it at a smaller angle
 NEAR_SHARE = 0.5  # largest distance of a strip's pixels from a face, as a ratio of the strip's width
 LEAST_SHARE = 0.4  # least share of a strip's pixels that are so near; low, because connected edges may hold thin faces
 WHOLE_SHARE = 0.7  # the same for a strip beside only one face
@@ -59,13 +58,12 @@ def without_fillets(depth_m: Array, packed: Array, law: Array, labels: Labels, k
 
 
 def _strips(regions: Regions, kinds: Indices, table: Array, half_width: Array, length: Array) -> dict[int, list[int]]:
-    """Return the faces that each strip continues: two or more, or one with a gentle transition at an outline."""
+    """Return the faces that each strip continues."""
     if not np.any((length >= LONG) & (half_width <= NARROWER * half_width.max())):
         return {}
     image = (regions.depth_m, regions.packed, regions.law, regions.labels)
     perspective, narrow_px = bool(regions.packed[0] > 0), NARROW * min(regions.labels.shape)
     beside: dict[int, list[int]] = {}
-    gentle = set()
     for pair, border_px, px, py in zip(*touching(regions.labels, regions.packed), strict=True):
         a, b = pair.tolist()
         strip, face = (a, b) if half_width[a] < half_width[b] else (b, a)
@@ -80,9 +78,7 @@ def _strips(regions: Regions, kinds: Indices, table: Array, half_width: Array, l
         if kinds[face] == PLANE and is_seam_grooved(*image, both, table[face], x, y):
             continue
         beside.setdefault(strip, []).append(face)
-        if turn <= GENTLE_RAD:
-            gentle.add(strip)
-    return {strip: faces for strip, faces in beside.items() if len(faces) > 1 or strip in gentle}
+    return beside
 
 
 def _goes_on(step: float, turn: float, *, is_flat: bool, is_narrow: bool) -> bool:

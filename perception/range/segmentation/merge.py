@@ -81,7 +81,7 @@ def _merged(
     a, b = (parts[k] for k in pair)
     if border.length_px < max(LEAST_BORDER_PX, TIP_SHARE * np.sqrt(min(a.pixels, b.pixels))):
         return 0.0, PLANE, a.th
-    gain, kind, th = judged(a, b, border.x, border.y, border.length_px, regions.law, bool(regions.packed[0] > 0))
+    gain, kind, th = judged(a, b, border.x, border.y, regions.law, bool(regions.packed[0] > 0))
     if gain > 0.0 and kind == PLANE:
         image = (regions.depth_m, regions.packed, regions.law, regions.labels)
         if is_seam_grooved(*image, np.isin(owner, pair), th, border.x, border.y):

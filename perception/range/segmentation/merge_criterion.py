@@ -8,7 +8,6 @@ import numpy as np
 
 from hal.arrays import Array, Mask
 from hal.jit import as_numpy_scalar, compiled
-from hal.small_algebra import solve_positive
 from perception.range.fitting import fit
 from perception.range.fitting.equations import TRIM_SIGMAS
 from perception.range.fitting.initialisation import start_plane
@@ -19,7 +18,6 @@ from perception.range.segmentation.finish import SLOW_NOISE_AREA_PX
 from perception.range.segmentation.grid import slow_share_at
 
 ROUNDS = as_numpy_scalar(3)  # of robust weights
-COEFFICIENTS = as_numpy_scalar(6)  # of a quadratic over x and y
 STEP_SIGMAS = 3.0
 SHARPEST_TURN_RAD = 1.2  # between facets of one narrow cylinder; an edge of a box turns by 1.57
 SMOOTH_TURN_RAD = 0.05  # smaller angles are no crease
@@ -28,15 +26,11 @@ SMOOTH_SHARE = 0.8  # least share of each part near the joint surface if no crea
 SMOOTH_LIMIT = 5.0  # sigmas; largest residual that counts as near in that case
 LEAST_SHARE = 0.85  # least share of each part within the trim of the joint surface
 UNEVEN_TURN_RAD = 0.25  # between facets of one uneven face
-ROUNDING_PX = 4.0  # largest width of a rounded edge
-ROUNDING_TURN_RAD = 0.6
-ROUNDING_SIGMAS = 2.0
 UNEVEN_SHARE = 0.02  # unevenness accepted in a face, as a ratio of the smaller facet's size
 LEAST_GAIN = 1e-3  # gain of a merge that is made for another reason than its cost
-SCRAP_SHARE = 0.1  # largest size of a fragment or rounded edge, relative to the larger part
+SCRAP_SHARE = 0.1  # largest size of a fragment, relative to the larger part
 PLAIN_MEAN_SQUARE = 1.6  # squared sigmas; limit of the mean square of a part with many independent noise values
 MOST_NOISE = 2.5  # largest ratio of observed to modelled variance by which the limits are widened
-CREASE_MEAN_SQUARE = 2.0  # if the mean square of a quadratic exceeds the limit by this factor, no surface fits
 # Mean square of a rough fit, with residuals cut at five sigmas, above which a full fit cannot reach the limits. GIVE_UP
 # is used for two planes or a smooth border; otherwise the threshold is the limit plus SLACK.
 GIVE_UP = 10.0
@@ -130,58 +124,50 @@ def _spread(part: Part, few: Array, few_normals: Array) -> None:
 
 @compiled
 def judged(
-    a: Part, b: Part, x: Array, y: Array, length_px: int, noise: Array, perspective: bool,
+    a: Part, b: Part, x: Array, y: Array, noise: Array, perspective: bool,
 ) -> tuple[float, int, Array]:  # fmt: skip
     """Find the best joint surface of two regions that touch at the rays (x, y); returns its gain, kind and parameters.
 
     The gain is the cost of two surfaces minus that of one; with a gain of 0 or less the regions stay separate.
-    `length_px`: number of pixels of their border.
     """
     large, small = (a, b) if a.pixels >= b.pixels else (b, a)
     shown = shown_noise(a, b)
     step, turn = step_and_turn(a.kind, a.th, b.kind, b.th, x, y, noise, perspective)
-    is_strip = small.pixels < ROUNDING_PX * length_px and small.pixels < SCRAP_SHARE * large.pixels
-    is_rounding = is_strip and step <= ROUNDING_SIGMAS * np.sqrt(shown) and turn <= ROUNDING_TURN_RAD
     tolerated = max(SMOOTH_TURN_RAD, SMOOTH_SIGMAS * np.hypot(a.tilt_rad, b.tilt_rad))
     is_smooth = turn < min(tolerated, 0.5 * SHARPEST_TURN_RAD)
-    may_join = step <= STEP_SIGMAS * np.sqrt(shown) and turn <= SHARPEST_TURN_RAD
-    # A rounded edge is merged with its face in any case, so no fits are needed.
-    if may_join and (is_smooth or not is_rounding):
+    if step <= STEP_SIGMAS * np.sqrt(shown) and turn <= SHARPEST_TURN_RAD:
         samples = np.concatenate((a.samples, b.samples), 1)
         limit = shown * max(mean_square_limit(a.patches), mean_square_limit(b.patches))
         both_flat = a.kind == PLANE and b.kind == PLANE
-        if is_smooth or not (both_flat and _is_creased(samples, perspective, CREASE_MEAN_SQUARE * limit)):
-            give_up = GIVE_UP if both_flat or is_smooth else limit + SLACK
-            with_quadric = QUADRIC in (a.kind, b.kind)
-            kinds = np.ones(5, np.bool_)
-            kinds[QUADRIC] = with_quadric
-            own, continued = large.kind, large.th
-            goes_on = own != PLANE and fit.rough_mean_square(own, continued, samples, perspective) <= give_up
-            if goes_on:
-                # If the surface of the larger region also explains the smaller one, no other kind needs to be tried.
-                continued, _ = fit.fit_robust(own, continued, samples, perspective, ROUNDS)
-                gain, _ = _gain(own, continued, a, b, is_smooth, perspective)
-                if gain > LEAST_GAIN:
-                    return gain, own, continued
-                kinds[own] = own == SPHERE and with_quadric  # an ellipsoid starts from a sphere
-            correlated = max(samples.shape[1] / (a.patches + b.patches), 1.0)
-            normals = np.concatenate((a.normals, b.normals))
-            ths, _, kept, score = fit.fit_kinds(samples, normals, perspective, kinds, correlated, give_up)
-            there = np.isfinite(score) & (kept > 0.5)
-            if both_flat and not there[PLANE]:
-                goes_on = True
-                continued, _ = fit.fit_robust(PLANE, a.th, samples, perspective, ROUNDS)
-            if goes_on:
-                ths[own], there[own] = continued, True
-            best_kind, best_gain, is_near = _best_fit(ths, there, a, b, is_smooth, perspective)
-            if best_gain > 0.0 or is_near:
-                return max(best_gain, LEAST_GAIN), best_kind, ths[best_kind].copy()
+        give_up = GIVE_UP if both_flat or is_smooth else limit + SLACK
+        with_quadric = QUADRIC in (a.kind, b.kind)
+        kinds = np.ones(5, np.bool_)
+        kinds[QUADRIC] = with_quadric
+        own, continued = large.kind, large.th
+        goes_on = own != PLANE and fit.rough_mean_square(own, continued, samples, perspective) <= give_up
+        if goes_on:
+            # If the surface of the larger region also explains the smaller one, no other kind needs to be tried.
+            continued, _ = fit.fit_robust(own, continued, samples, perspective, ROUNDS)
+            gain, _ = _gain(own, continued, a, b, is_smooth, perspective)
+            if gain > LEAST_GAIN:
+                return gain, own, continued
+            kinds[own] = own == SPHERE and with_quadric  # an ellipsoid starts from a sphere
+        correlated = max(samples.shape[1] / (a.patches + b.patches), 1.0)
+        normals = np.concatenate((a.normals, b.normals))
+        ths, _, kept, score = fit.fit_kinds(samples, normals, perspective, kinds, correlated, give_up)
+        there = np.isfinite(score) & (kept > 0.5)
+        if both_flat and not there[PLANE]:
+            goes_on = True
+            continued, _ = fit.fit_robust(PLANE, a.th, samples, perspective, ROUNDS)
+        if goes_on:
+            ths[own], there[own] = continued, True
+        best_kind, best_gain, is_near = _best_fit(ths, there, a, b, is_smooth, perspective)
+        if best_gain > 0.0 or is_near:
+            return max(best_gain, LEAST_GAIN), best_kind, ths[best_kind].copy()
         if both_flat and turn < UNEVEN_TURN_RAD:
             th = start_plane(fit.points_of(samples, perspective))
             if _is_uneven(th, a, b, perspective):
                 return LEAST_GAIN, PLANE, th
-    if is_rounding:
-        return LEAST_GAIN, large.kind, large.th
     if small.pixels > SCRAP_SHARE * large.pixels:
         return 0.0, large.kind, large.th
     gain = bend.scrap_gain(large.kind, large.th, small.kind, small.th, small.samples, small.pixels, noise, perspective)
@@ -235,39 +221,6 @@ def _is_uneven(th: Array, a: Part, b: Part, perspective: bool) -> bool:
         if not np.mean(e < tolerance_m) > SMOOTH_SHARE:
             return False
     return True
-
-
-@compiled
-def _is_creased(samples: Array, perspective: bool, limit: float) -> bool:
-    """Return whether the mean squared residual of a quadratic in x and y exceeds `limit` squared sigmas per sample.
-
-    A quadratic follows any smooth surface that turns by at most `SHARPEST_TURN_RAD`. If it fails, no joint surface
-    needs to be fitted.
-    """
-    n = samples.shape[1]
-    A, b, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
-    mx, my = np.mean(samples[0]), np.mean(samples[1])
-    scale = 1.0 / max(np.std(samples[0]), np.std(samples[1]), 1e-12)
-    g0 = 1.0 / samples[2, 0] if perspective else samples[2, 0]
-    total = 0.0
-    for i in range(n):
-        u, v, z = (samples[0, i] - mx) * scale, (samples[1, i] - my) * scale, samples[2, i]
-        row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, u, v, u * u, u * v, v * v
-        # Under perspective planes are linear in 1 / z, and sigma is converted accordingly.
-        value = (1.0 / z if perspective else z) - g0
-        sigma = samples[3, i] / (z * z) if perspective else samples[3, i]
-        w = 1.0 / (sigma * sigma)
-        total += w * value * value
-        for j in range(6):
-            b[j] += w * row[j] * value
-            for k in range(j + 1):
-                A[j, k] += w * row[j] * row[k]
-    x = b.copy()
-    if not solve_positive(A, x, COEFFICIENTS):
-        return False
-    for j in range(6):
-        total -= x[j] * b[j]
-    return bool(total > limit * max(n - 6, 1))
 
 
 @compiled

@@ -150,14 +150,6 @@ def test_facets_of_upholstery_are_one_face_and_faces_of_a_blunt_body_are_not(tur
     assert (len(set(merged(left, plane([0.0, 0.0, -1.0], -2.0), FINE))) == 1) == is_one
 
 
-@pytest.mark.parametrize(("width_px", "is_one"), [(3, True), (9, False)])
-def test_a_rounded_edge_belongs_to_its_face_and_a_chamfer_does_not(width_px, is_one):
-    strip = plane([np.sin(0.4), 0.0, -np.cos(0.4)], -2.0 * np.cos(0.4))  # meets the wall's end, at x = 0, at an angle
-    regions = image_of([(WALL_2M, LEFT), (strip, box(20, 100, 80, 80 + width_px))], FINE)
-    owners = merge_touching(regions, [PLANE, PLANE], [WALL_2M[1], strip[1]])
-    assert (len(set(owners)) == 1) == is_one
-
-
 def test_a_step_between_parallel_faces_stays():
     assert merged(plane([0, 0, -1], -2.0), plane([0, 0, -1], -2.1), SLOW) == [1, 2]
 

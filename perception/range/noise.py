@@ -21,7 +21,7 @@ from perception.range.sensor import RangeSensorModel
 
 WINDOW = 5  # samples along a window; a window of 25 samples rarely holds a gross error
 BASIS = quadratics(WINDOW)
-WINDOWS_ACROSS = 30  # of the small windows, along the shorter side of a large image
+WINDOWS_ACROSS = 24  # of the small windows, along the shorter side of a large image
 LARGE_SHARE = 1 / 60  # spacing of the large window's samples, as a ratio of the shorter side; at least 2 pixels
 QUANTILE = 0.25  # windows on creases, jumps and gross errors lie above this quantile in all but the busiest scenes
 WORST_SHARE = 0.03  # of the depth: an image that scatters more shows no surface, and no model may explain it as one
@@ -100,7 +100,7 @@ def estimate_noise(depth_m: Array, sensor: RangeSensorModel, *, depths_m: Array 
     floor = np.array([FLOOR_RATIO * sensor.pitch_m(float(z)) for z in np.sqrt(z2)])
     small = _window_law(g, perspective, spacing_px=1, stride_px=max(7, min(g.shape) // WINDOWS_ACROSS))
     spacing = max(2, round(LARGE_SHARE * min(g.shape)))
-    large = _window_law(g, perspective, spacing_px=spacing, stride_px=2 * spacing)
+    large = _window_law(g, perspective, spacing_px=spacing, stride_px=3 * spacing)
     step = coding_step(depth_m)
     white = _fit_law(z2, np.maximum(small[0] + small[1] * z2, floor))
     # The slow part is the noise in the large windows in excess of that in the small ones and of the code step.

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array, Image
-from hal.jit import compiled
 from hal.panel import Panel
 from perception.vision.noise import noise_sigma
 from perception.vision.projection import PanelProjection
@@ -46,18 +45,14 @@ class Registration:
 
     Attributes:
         view: the registered view.
-        covariance: of its motion parameters.
         support: share of the visible model edges with an image edge within 2 px; NaN if too few are in view.
-        rms_px: root mean square offset of these edges.
         is_framed: whether a horizontal and a vertical side of the plate's border were found, so that the edges of other
         objects cannot have misled it.
         objects: per object name, the fit to its own edges; only for kinds with edges that every state shows.
     """
 
     view: PanelProjection
-    covariance: Array
     support: float
-    rms_px: float
     is_framed: bool
     objects: dict[str, ObjectFit]
 
@@ -89,29 +84,20 @@ def register(gray: Image, view: PanelProjection, panel: Panel) -> Registration:
         view: prediction, good to a few pixels.
     """
     image = edge_image(gray)
-    smooth, slope_noise = image.smooth, image.slope_noise
     own = {panel_object.name: edges for panel_object in panel.objects if (edges := edges_of(panel_object)) is not None}
     border = plate_edges(panel)
     everything = _joined([border, *own.values()])
-    covariance = np.diag(view.prior_sigma**2)
-    reference = view
     delta = np.zeros(len(view.prior_sigma))
     for window in WINDOWS_PX:
-        motion = reference.moved(delta).motion(everything.points_m)
-        delta, covariance = _step(
-            smooth, slope_noise, reference, delta, edges=everything, window_px=window, motion=motion
-        )
-    moved = reference.moved(delta)
-    found = _look(smooth, slope_noise, moved, everything, LAST_LOOK_PX)
-    near = found.ok & (np.abs(found.offset_px) <= NEAR_PX)
+        delta = _step(image, view, delta, everything, window, view.moved(delta).motion(everything.points_m))
+    moved = view.moved(delta)
+    visible, near = confirmed(image, moved, everything)
     built_m = panel.tolerances.position_m
     local = {name: fit_object(image, moved, edges, built_m) for name, edges in own.items()}
     return Registration(
         view=moved,
-        covariance=covariance,
-        support=float(near.sum() / found.visible.sum()) if found.visible.sum() >= MIN_VISIBLE else float("nan"),
-        rms_px=float(np.sqrt(np.mean(found.offset_px[near] ** 2))) if near.any() else float("nan"),
-        is_framed=_is_framed(found.visible[: len(border.points_m)], near[: len(border.points_m)]),
+        support=float(near.sum() / visible.sum()) if visible.sum() >= MIN_VISIBLE else float("nan"),
+        is_framed=_is_framed(visible[: len(border.points_m)], near[: len(border.points_m)]),
         objects=local,
     )
 
@@ -146,13 +132,13 @@ def follow_edges(image: EdgeImage, view: V, outline: Outline, windows_px: Sequen
     delta = np.zeros(len(view.prior_sigma))
     motion = view.motion(outline.points_m)  # nearly constant within a dozen pixels
     for window in windows_px:
-        delta, _ = _step(image.smooth, image.slope_noise, view, delta, edges=outline, window_px=window, motion=motion)
+        delta = _step(image, view, delta, outline, window, motion)
     return view.moved(delta)
 
 
 def confirmed(image: EdgeImage, view: PanelProjection, outline: Outline) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which samples of the outline (N,) are inside the image, and which have an edge within `NEAR_PX`."""
-    found = _look(image.smooth, image.slope_noise, view, outline, LAST_LOOK_PX)
+    found = _look(image, view, outline, LAST_LOOK_PX)
     return found.visible, found.ok & (np.abs(found.offset_px) <= NEAR_PX)
 
 
@@ -172,23 +158,15 @@ class _Found:
     ok: NDArray[np.bool_]
 
 
-def _look(
-    smooth: NDArray[np.float32], slope_noise: float, view: PanelProjection, edges: Outline, window_px: float
-) -> _Found:
+def _look(image: EdgeImage, view: PanelProjection, edges: Outline, window_px: float) -> _Found:
     """Find the strongest image edge along every normal of the model."""
     points, ahead = _with_ahead(view, edges)
     normals = ahead - points
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(length > 0, length, 1.0)
-    offset, slope, visible = strongest_edges(smooth, points, normals, window_px)
-    ok = visible & (slope > EDGE_TO_NOISE * slope_noise + 0.5)
+    offset, slope, visible = strongest_edges(image.smooth, points, normals, window_px)
+    ok = visible & (slope > EDGE_TO_NOISE * image.slope_noise + 0.5)
     return _Found(offset_px=offset, normals_px=normals, visible=visible, ok=ok)
-
-
-def _ahead(view: PanelProjection, edges: Outline) -> Array:
-    """Return the displacement in the image (N, 2), px, for a step of `NORMAL_STEP_M` along every normal."""
-    points, ahead = _with_ahead(view, edges)
-    return ahead - points
 
 
 def _with_ahead(view: PanelProjection, edges: Outline) -> tuple[Array, Array]:
@@ -201,50 +179,29 @@ def _with_ahead(view: PanelProjection, edges: Outline) -> tuple[Array, Array]:
 
 
 def _step(
-    smooth: NDArray[np.float32], slope_noise: float, reference: PanelProjection, delta: Array, *, edges: Outline, window_px: float,
-    motion: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Do two Gauss-Newton steps on the edges found in one window; returns the motion parameters and their covariance.
+    image: EdgeImage, reference: PanelProjection, delta: Array, edges: Outline, window_px: float, motion: Array
+) -> Array:
+    """Do two Gauss-Newton steps on the edges found in one window; returns the motion parameters.
 
     `motion` (N, 2, P) are the derivatives of the samples over the parameters.
     """
     sigma = reference.prior_sigma
     information = np.diag(1.0 / sigma**2)
     for _ in range(2):
-        view = reference.moved(delta)
-        found = _look(smooth, slope_noise, view, edges, window_px)
+        found = _look(image, reference.moved(delta), edges, window_px)
         if found.ok.sum() < len(delta):
-            return delta, np.diag(sigma**2)
-        N, g = _normal_equations(motion, found.normals_px, found.offset_px, found.ok)
-        N += information
-        delta = delta + np.linalg.solve(N, g - information @ delta)
-    return delta, np.asarray(np.linalg.inv(N), float)
+            return delta
+        J = np.einsum("nkp,nk->np", motion[found.ok], found.normals_px[found.ok])
+        r = found.offset_px[found.ok]
+        weighted = J.T * _weights(r, MEASUREMENT_SIGMA_PX)
+        delta = delta + np.linalg.solve(weighted @ J + information, weighted @ r - information @ delta)
+    return delta
 
 
-@compiled
-def _spread(residuals: Array) -> float:
-    """Return the standard deviation of residuals about zero, by the median of their magnitudes."""
-    return float(1.4826 * np.median(np.abs(residuals)))
-
-
-@compiled
-def _normal_equations(motion: Array, normals_px: Array, offset_px: Array, ok: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return J^T W J and J^T W r of the edges found, with Cauchy weights W.
-
-    J is the motion (N, 2, P) along the normals (N, 2), and r is the offset (N,) found there.
-    """
-    r = offset_px[ok]
-    scale = max(_spread(r), MEASUREMENT_SIGMA_PX)
-    count = motion.shape[2]
-    N, g = np.zeros((count, count)), np.zeros(count)
-    for k in np.flatnonzero(ok):
-        weight = 1.0 / (1.0 + (offset_px[k] / (1.5 * scale)) ** 2) / scale**2
-        along = motion[k, 0] * normals_px[k, 0] + motion[k, 1] * normals_px[k, 1]
-        for i in range(count):
-            g[i] += weight * along[i] * offset_px[k]
-            for j in range(count):
-                N[i, j] += weight * along[i] * along[j]
-    return N, g
+def _weights(residuals: Array, least_sigma: float) -> Array:
+    """Return the Cauchy weights of residuals whose scale is their median magnitude, but at least `least_sigma`."""
+    scale = max(1.4826 * float(np.median(np.abs(residuals))), least_sigma)
+    return np.asarray(1.0 / (1.0 + (residuals / (1.5 * scale)) ** 2) / scale**2)
 
 
 def fit_object(image: EdgeImage, view: PanelProjection, edges: Outline, built_m: float) -> ObjectFit:
@@ -253,10 +210,11 @@ def fit_object(image: EdgeImage, view: PanelProjection, edges: Outline, built_m:
     `built_m` is the standard deviation of the object's position on the plate. The edges of an object have a common
     error that does not average out, because a cast shadow or a side wall moves all edges of one side.
     """
-    scale_px_per_m = float(np.nanmedian(np.linalg.norm(_ahead(view, edges), axis=1))) / NORMAL_STEP_M
+    points, ahead = _with_ahead(view, edges)
+    scale_px_per_m = float(np.nanmedian(np.linalg.norm(ahead - points, axis=1))) / NORMAL_STEP_M
     reach_px = edges.reach_m * scale_px_per_m
     prior_px = float(np.hypot(REGISTERED_SIGMA_PX, built_m * scale_px_per_m))
-    found = _look(image.smooth, image.slope_noise, view, edges, float(np.clip(1.5 + reach_px, 4.0, 9.0)))
+    found = _look(image, view, edges, float(np.clip(1.5 + reach_px, 4.0, 9.0)))
     visible = int(found.visible.sum())
     if found.ok.sum() < 6:
         share = 0.0 if visible >= 6 else float("nan")
@@ -267,9 +225,7 @@ def fit_object(image: EdgeImage, view: PanelProjection, edges: Outline, built_m:
     prior = np.diag([1e-6, 1e-6, 1 / (GROWTH_SIGMA_PX + reach_px) ** 2])
     solution, N = np.array([0.0, 0.0, float(np.median(r))]), prior
     for _ in range(4):
-        e = r - J @ solution
-        scale = max(_spread(e), 0.3)
-        w = 1.0 / (1.0 + (e / (1.5 * scale)) ** 2) / scale**2 / 2.0  # neighbouring samples share their noise
+        w = _weights(r - J @ solution, 0.3) / 2.0  # neighbouring samples share their noise
         N = J.T @ (w[:, None] * J) + prior
         solution = np.linalg.solve(N, J.T @ (w * r))
     share = float((np.abs(r - J @ solution) < 1.5).sum() / max(1, visible))

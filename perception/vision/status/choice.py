@@ -24,21 +24,26 @@ def choose(names: Sequence[str], evidence: Array, *, noise: float, seen: float, 
     """
     if seen < 0.4:
         return refused(f"the {what} cannot be seen (glare, shadow or cover): change the angle or the light")
+    unseen = f"no {what} stands out: come closer or add light"
     best = int(np.argmax(evidence))
     others = [float(e) for name, e in zip(names, evidence, strict=True) if name != names[best]]
     rival = max(others, default=0.0)
     peak = float(evidence[best])
     if peak <= 0.0:
-        return refused(f"no {what} stands out: come closer or add light")
-    confidence = probability(
+        return refused(unseen)
+    status = PatchReading(state=names[best], confidence=contrast_confidence(peak, rival, noise, seen))
+    return gated(status) if peak >= 1.5 * noise else doubted(status, unseen)
+
+
+def contrast_confidence(peak: float, rival: float, noise: float, seen: float) -> float:
+    """Return the confidence of a contrast (gray levels) by the noise, its best rival, and the visible share of the object."""
+    return probability(
         [
             (np.log(peak / noise), np.log(2.5), 0.3),
             (np.log((rival + noise) / (peak + noise)), np.log(0.70), -0.12),
             (seen, 0.55, 0.1),
         ]
     )
-    status = PatchReading(state=names[best], confidence=confidence)
-    return gated(status) if peak >= 1.5 * noise else doubted(status, f"no {what} stands out: come closer or add light")
 
 
 def contrast_noise(patch: Patch) -> float:

@@ -6,13 +6,11 @@ import numpy as np
 
 from hal.panel.knob import Knob
 from perception.vision.patch import Patch
-from perception.vision.reading import PatchReading, gated, probability, refused
-from perception.vision.status.bar import bar_contrast
-from perception.vision.status.choice import contrast_noise
+from perception.vision.reading import PatchReading, gated, refused
+from perception.vision.status.choice import contrast_confidence, contrast_noise
 from perception.vision.status.reader import Reader
+from perception.vision.status.rotary import mark_contrast
 
-MARK_FROM, MARK_TO = 0.35, 0.80  # share of the knob's radius over which the mark runs
-MARK_HALF_WIDTH = 0.06
 STEP_RAD = np.deg2rad(1.0)
 BEYOND_RAD = np.deg2rad(6.0)  # largest angle of a mark beyond its scale
 RIVAL_RAD = np.deg2rad(25.0)  # anything farther away is a different mark
@@ -21,19 +19,14 @@ SIGMA_RAD = np.deg2rad(0.8)
 
 def read_knob(patch: Patch, spec: Knob) -> PatchReading:
     """Return the value of a knob. `patch` shows the plane of the knob's face."""
-    R, scale = spec.radius_m, spec.scale
+    scale = spec.scale
     low, high = sorted((scale.at_min, scale.at_max))
     angles = np.arange(low - BEYOND_RAD, high + BEYOND_RAD, STEP_RAD)
-    a = np.linspace(0, 2 * np.pi, 24)
-    seen = patch.seen(np.outer([0.4, 0.7], np.sin(a)) * R, np.outer([0.4, 0.7], np.cos(a)) * R)
+    evidence, seen = mark_contrast(patch, spec.radius_m, angles)
     if seen < 0.4:
         return refused(
             "the knob cannot be seen (glare, shadow or cover): change the angle or the light", unit=scale.unit
         )
-    half = max(MARK_HALF_WIDTH * R, 0.4 / patch.image_px_per_m)
-    evidence = np.abs(
-        bar_contrast(patch, angles, along_m=(MARK_FROM * R, MARK_TO * R), half_width_m=half, quantile=0.35)
-    )
     noise = contrast_noise(patch)
     best = int(evidence.argmax())
     peak = float(evidence[best])
@@ -44,15 +37,9 @@ def read_knob(patch: Patch, spec: Knob) -> PatchReading:
     weights = np.maximum(evidence[near] - 0.5 * peak, 0.0)
     # The mark's middle, to which both flanks contribute equally
     angle = float((weights @ angles[near]) / weights.sum())
-    confidence = probability(
-        [
-            (np.log(peak / noise), np.log(2.5), 0.3),
-            (np.log((rival + noise) / (peak + noise)), np.log(0.70), -0.12),
-            (seen, 0.55, 0.1),
-        ]
-    )
     per_rad = scale.span / abs(scale.at_max - scale.at_min)
     value = min(max(scale.value_at(angle), scale.minimum), scale.maximum)
+    confidence = contrast_confidence(peak, rival, noise, seen)
     return gated(PatchReading(value=value, unit=scale.unit, uncertainty=SIGMA_RAD * per_rad, confidence=confidence))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hal.arrays import Array
 from hal.panel import Rotary
 from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading
@@ -18,15 +19,19 @@ WOBBLE_RAD = np.deg2rad(np.linspace(-9, 9, 7))  # tried deviations of a detent f
 
 def read_rotary(patch: Patch, spec: Rotary) -> PatchReading:
     """Return the state of a selector. `patch` shows the plane of the knob's face."""
-    R = spec.radius_m
     angles = np.array([state.angle_rad for state in spec.states])
-    half = max(MARK_HALF_WIDTH * R, 0.4 / patch.image_px_per_m)
-    tried = (angles[:, None] + WOBBLE_RAD).ravel()
-    contrast = bar_contrast(patch, tried, along_m=(MARK_FROM * R, MARK_TO * R), half_width_m=half, quantile=0.35)
-    evidence = np.abs(contrast).reshape(len(angles), -1).max(axis=1)
-    a = np.linspace(0, 2 * np.pi, 24)
-    seen = patch.seen(np.outer([0.4, 0.7], np.sin(a)) * R, np.outer([0.4, 0.7], np.cos(a)) * R)
+    contrast, seen = mark_contrast(patch, spec.radius_m, (angles[:, None] + WOBBLE_RAD).ravel())
+    evidence = contrast.reshape(len(angles), -1).max(axis=1)
     return choose([s.name for s in spec.states], evidence, noise=contrast_noise(patch), seen=seen, what="knob mark")
+
+
+def mark_contrast(patch: Patch, radius_m: float, angles_rad: Array) -> tuple[Array, float]:
+    """Return the contrast (N,), gray levels, of a mark at each angle on a knob, and the visible share of the knob."""
+    half = max(MARK_HALF_WIDTH * radius_m, 0.4 / patch.image_px_per_m)
+    along_m = (MARK_FROM * radius_m, MARK_TO * radius_m)
+    contrast = bar_contrast(patch, angles_rad, along_m=along_m, half_width_m=half, quantile=0.35)
+    a, r = np.linspace(0, 2 * np.pi, 24), radius_m * np.array([[0.4], [0.7]])
+    return np.abs(contrast), patch.seen(r * np.sin(a), r * np.cos(a))
 
 
 READER = Reader[Rotary](read=read_rotary, guesses_right=0.4, is_telling=True)

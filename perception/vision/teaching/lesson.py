@@ -36,9 +36,8 @@ NOTHING_SIZE_M = (0.010, 0.010)
 # Reach of a look over half of the object's larger side. On two lift panels five clicks find .81 and .92 of the buttons without a
 # limit, and .95 and .91 with it; 1.7 and 2.2 are as good.
 REACH = 2.0
-SURROUNDINGS_M = (
-    0.15  # side of the square around an object that a look needs: its circles, and the plate between objects
-)
+# Side of the square around an object that a look needs: its circles, and the plate between objects.
+SURROUNDINGS_M = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -199,7 +198,7 @@ def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, 
     clicks = overview.on_ground(clicks_m)
     outline = outline_at(overview.ground, clicks) if kind != NOTHING else None
     middle = clicks[0] if len(clicks) == 1 else clicks[:2].mean(axis=0) if len(clicks) == 2 else clicks[2]
-    place = _snapped(middle, candidate_places(overview.ground.edges))
+    place = snapped(middle, candidate_places(overview.ground.edges), SNAP_M * PLATE_PX_PER_M)
     empty = np.zeros((0, 2))
     outline_px = overview.in_image(overview.on_plate(outline.polygon_px)) if outline is not None else empty
     return Example(
@@ -335,13 +334,10 @@ def _size_m(clicks_m: Array, outline: SubObject | None) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def _snapped(place: Array, candidates: Array) -> Array:
-    """Return the nearest candidate place if it is near enough, else the given place."""
-    if not len(candidates):
-        return place
+def snapped(place: Array, candidates: Array, reach: float) -> Array:
+    """Return the nearest of the candidate places (N, 2) if it is within reach, else the given place (2,)."""
     away = np.linalg.norm(candidates - place, axis=1)
-    nearest = int(away.argmin())
-    return np.asarray(candidates[nearest] if away[nearest] < SNAP_M * PLATE_PX_PER_M else place)
+    return np.asarray(candidates[int(away.argmin())] if len(away) and away.min() < reach else place)
 
 
 def _distance(look: Array, knowledge: Knowledge, kind: TaughtKind) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from hal.arrays import Array
 from hal.errors import InvalidRequest
 from perception.vision.finding.features import PLATE_PX_PER_M
-from perception.vision.teaching.lesson import Overview, plate_points
+from perception.vision.teaching.lesson import Overview, plate_points, snapped
 from perception.vision.teaching.sub_object import sub_objects
 
 SIDES = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], float)
@@ -50,7 +50,7 @@ def find_border_lights(overview: Overview, clicks_px: Sequence[tuple[float, floa
     circles = np.array(round_ones).reshape(-1, 2)
     if len(clicks_px) == 4:
         clicked = plate_points(overview.view, clicks_px, overview.plate_m)
-        places = np.array([_near(place, circles) for place in clicked])
+        places = np.array([snapped(place, circles, SNAP_M) for place in clicked])
         return LightsFound(places_m=places[_clockwise(places)], are_seen=True)
     corners = SIDES * half
     found = [_in_corner(corner, circles) for corner in corners]
@@ -66,12 +66,6 @@ def _in_corner(corner: Array, circles: Array) -> Array | None:
     away = np.abs(circles - corner).max(axis=1, initial=0.0)
     near = np.flatnonzero(away < LIGHT_REACH_M)
     return circles[near[int(away[near].argmin())]] if len(near) else None
-
-
-def _near(place: Array, circles: Array) -> Array:
-    """Return the middle of the circle that was clicked, or the click if there is none."""
-    away = np.linalg.norm(circles - place, axis=1)
-    return np.asarray(circles[int(away.argmin())] if len(away) and away.min() < SNAP_M else place)
 
 
 def _clockwise(places: Array) -> list[int]:

@@ -17,7 +17,6 @@ from perception.vision.photographs.dial import read_dial
 from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.registration.edge_search import strongest_edges
 from perception.vision.status.display import read_window
-from perception.vision.status.occluders import ring_medians
 
 DIGIT_PX = (72, 40)  # height and width
 STROKE_PX = 8
@@ -49,7 +48,6 @@ def _find_objects(picture: NDArray[np.uint8]) -> None:
     without_cables(banded, np.full(banded.shape, 200.0, np.float32))
     middle = np.array([[40.0, 40.0]])
     strongest_edges(picture.astype(np.float32), middle, np.array([[1.0, 0.0]]), 4.0)
-    ring_medians(picture[40].copy(), 9)
     step_counts(picture, 4)
 
 

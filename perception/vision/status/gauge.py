@@ -7,7 +7,7 @@ import numpy as np
 from hal.panel import Gauge, Scale
 from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading, doubted, gated, probability, refused
-from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
+from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.pointer import PointerFit, PointerSearch, find_pointer, wrapped
 from perception.vision.status.reader import Reader
 
@@ -17,12 +17,9 @@ FINE_TO = 0.48  # numerals begin at half of the radius; when blurred, they shift
 STOP_RAD = np.deg2rad(6.0)  # a pointer rests at most this far beyond its scale
 LEAST_SEEN = 0.25  # share of the face that must be visible
 MOST_SIGMA_RAD = 0.03
-# Score of the best rival over that of the pointer: half and scale. Numerals may lie where a gauge's pointer is
-# searched.
-RIVAL = (
-    0.50,
-    0.03,
-)  # of 330 synthetic pointers read correctly 98 % have less than 0.45; half of the misread ones have more than 0.6
+# Score of the best rival over that of the pointer: half and scale. Numerals may lie where a gauge's pointer is searched.
+# Of 330 synthetic pointers read correctly 98 % have less than 0.45; half of the misread ones have more than 0.6
+RIVAL = (0.50, 0.03)
 SIGMA_RAD = (0.026, 0.003)  # 99 % of the pointers read correctly have less than 0.026
 LEAST_SHOWN = 0.52  # visible share of the pointer's radii: beside a cable, a numeral alone could reach less than this
 
@@ -30,7 +27,8 @@ LEAST_SHOWN = 0.52  # visible share of the pointer's radii: beside a cable, a nu
 def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
     """Return the value of a round gauge. `patch` shows the plane of the face, origin at its middle."""
     R = spec.radius_m
-    seen = _seen(patch, R)
+    a, r = np.linspace(0, 2 * np.pi, 48, endpoint=False), R * np.array([[0.2], [0.4], [0.6], [0.75]])
+    seen = patch.seen(r * np.sin(a), r * np.cos(a))
     search = PointerSearch(
         pivot_m=(0.0, 0.0),
         inner_m=POINTER_FROM * R,
@@ -38,7 +36,7 @@ def read_gauge(patch: Patch, spec: Gauge) -> PatchReading:
         fine_m=(POINTER_FROM * R, FINE_TO * R),
         from_hub=True,
     )
-    cover = lying_across(patch, half_width_m=R, half_height_m=R, is_round=True, most=MOST_COVERED)
+    cover = lying_across(patch, half_width_m=R, half_height_m=R, is_round=True)
     fit = find_pointer(patch, search, cover=cover)
     if fit is None:
         return no_pointer(seen, spec.scale.unit)
@@ -108,13 +106,6 @@ def pointer_confidence(
             (0.35 - fit.unknown, 0.0, 0.05),
         ]
     )
-
-
-def _seen(patch: Patch, radius_m: float) -> float:
-    """Return the visible share of the face."""
-    a = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    r = np.array([0.2, 0.4, 0.6, 0.75])[:, None] * radius_m
-    return patch.seen(r * np.sin(a), r * np.cos(a))
 
 
 READER = Reader[Gauge](read=read_gauge, is_telling=True)

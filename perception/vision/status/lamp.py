@@ -27,7 +27,7 @@ def read_lamp(patch: Patch, spec: Lamp) -> PatchReading:
     """Return the state of a lamp. `patch` shows the plate plane or the lens."""
     light = patch.gray if patch.colour is None else patch.colour.max(axis=2)
     beyond_m = CLEAR_OF_BEZEL * spec.radius_m
-    hidden = cables_across(patch, radius_m=beyond_m, own_rad=np.empty(0))
+    hidden = cables_across(patch, radius_m=beyond_m)
     core, rim, plate = (_ring(patch, light, spec.radius_m, r, hidden) for r in (CORE, RIM, PLATE))
     if min(len(core), len(rim), len(plate)) < LEAST_SEEN * RING_PLACES:
         return refused("something lies across the lamp: move it or look past it")

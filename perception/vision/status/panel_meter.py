@@ -8,7 +8,7 @@ from hal.panel import PanelMeter
 from perception.vision.patch import Patch
 from perception.vision.reading import PatchReading
 from perception.vision.status.gauge import STOP_RAD, no_pointer, status_of_pointer
-from perception.vision.status.occluder_bands import MOST_COVERED, lying_across
+from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.pointer import PointerSearch, find_pointer
 from perception.vision.status.reader import Reader
 
@@ -21,14 +21,12 @@ SIGMA_RAD = (0.0125, 0.0015)  # 98 % of them have less than 0.009, half of the m
 def read_panel_meter(patch: Patch, spec: PanelMeter) -> PatchReading:
     """Return the value of a panel meter. `patch` shows the plane of the face, origin at the middle of the housing."""
     lo, hi = sorted((spec.scale.at_min, spec.scale.at_max))
-    pivot = (0.0, -spec.pivot_below_m)
-    seen = _seen(patch, spec, lo, hi)
+    a, r = np.linspace(lo, hi, 24), spec.needle_m * np.array([[0.5], [0.65], [0.8], [0.95]])
+    seen = patch.seen(r * np.sin(a), r * np.cos(a) - spec.pivot_below_m)  # of the area that the pointer sweeps
     margin = 1.5 * STOP_RAD
-    cover = lying_across(
-        patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False, most=MOST_COVERED
-    )
+    cover = lying_across(patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False)
     search = PointerSearch(
-        pivot_m=pivot,
+        pivot_m=(0.0, -spec.pivot_below_m),
         inner_m=POINTER_FROM * spec.needle_m,
         outer_m=POINTER_TO * spec.needle_m,
         fine_m=(POINTER_FROM * spec.needle_m, 0.92 * spec.needle_m),
@@ -40,13 +38,6 @@ def read_panel_meter(patch: Patch, spec: PanelMeter) -> PatchReading:
     if fit is None:
         return no_pointer(seen, spec.scale.unit)
     return status_of_pointer(fit, spec.scale, seen, rival=RIVAL, sigma_rad=SIGMA_RAD)
-
-
-def _seen(patch: Patch, spec: PanelMeter, lo: float, hi: float) -> float:
-    """Return the visible share of the area that the pointer sweeps."""
-    a = np.linspace(lo, hi, 24)
-    r = np.array([0.5, 0.65, 0.8, 0.95])[:, None] * spec.needle_m
-    return patch.seen(r * np.sin(a), r * np.cos(a) - spec.pivot_below_m)
 
 
 READER = Reader[PanelMeter](read=read_panel_meter, is_telling=True)

@@ -30,11 +30,10 @@ RADIUS_SIGMA_M = 1.5e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CapHeight:
-    """Measured height of a cap's edge above the plate in m, standard deviation, and share of the edge that was found."""
+    """Measured height of a cap's edge above the plate and its standard deviation, m."""
 
     height_m: float
     sigma_m: float
-    found: float
 
 
 def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, foot_m: float | None) -> CapHeight | None:
@@ -59,7 +58,7 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     reach = np.where(is_face, outward * (high_m - low_m) / 2, 0.0) + slack
     offset, found, width_px, glared = _edges(patch, radius_m, a, middle, expected, reach)
     beyond_m = CLEAR_OF_RING * radius_m
-    hidden = cables_across(patch, radius_m=beyond_m, own_rad=np.empty(0))
+    hidden = cables_across(patch, radius_m=beyond_m)
     if hidden is not None:
         found &= sample_at(hidden.astype(np.uint8), *_at(patch, radius_m + offset, a, middle)) < 0.5
     ok = found & use
@@ -89,7 +88,6 @@ def cap_height(patch: Patch, *, radius_m: float, low_m: float, high_m: float, fo
     return CapHeight(
         height_m=float(middle + solution[0]),
         sigma_m=float(np.hypot(np.sqrt(np.linalg.inv(N)[0, 0]), pull_m)),
-        found=float(ok.mean()),
     )
 
 

@@ -57,7 +57,7 @@ class Shades:
 
 def cap_shades(patch: Patch, radius_m: float) -> Shades:
     """Measure shadow and highlight of a round cap of that radius around the patch's middle."""
-    hidden = cables_across(patch, radius_m=CLEAR_OF_RING * radius_m, own_rad=np.empty(0))
+    hidden = cables_across(patch, radius_m=CLEAR_OF_RING * radius_m)
     lost = ~patch.inside | (patch.gray >= WHITE_LEVEL)
     if hidden is not None:
         size = round(2 * BLUR_PX) + 1
@@ -94,14 +94,8 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: floa
     if known.mean() < LEAST_FACE:
         return np.nan
     form = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=-1).reshape(-1, 4)
-    area = (known * FACE_RADII[:, None]).ravel()
-    weight, off, scale = area, np.zeros_like(gray), 1.0
-    for _ in range(ROUNDS):
-        weighted = form * weight[:, None]
-        smooth = form @ np.linalg.solve(weighted.T @ form + 1e-9 * np.eye(4), weighted.T @ gray.ravel())
-        off = gray - smooth.reshape(gray.shape)
-        scale = max(1.4826 * float(np.median(np.abs(off[known]))), 1.0)
-        weight = area / (1.0 + (off.ravel() / (2 * scale)) ** 2)
+    smooth, scale = _fitted(form, gray.ravel(), (known * FACE_RADII[:, None]).ravel())
+    off = gray - (form @ smooth).reshape(gray.shape)
     turns = np.concatenate([np.stack([off * known, known.astype(float)])] * 3, axis=2)
     total, count = (cv2.blur(part, BLOB)[:, len(ANGLES) : 2 * len(ANGLES)] for part in turns)
     mean = np.where(count > 0.6, total / np.maximum(count, 0.1), -np.inf)
@@ -140,13 +134,21 @@ def _mean_round(patch: Patch, unknown: NDArray[np.uint8], radii_m: Array) -> tup
 
 
 def _wave(values: Array, known: NDArray[np.bool_]) -> Array:
-    """Return mean, cosine and sine (3,) of the known values around the cap, by iteratively reweighted least squares."""
-    base, y = WAVES[known], values[known]
-    weight, found = np.ones(len(y)), np.zeros(3)
+    """Return mean, cosine and sine (3,) of the known values around the cap."""
+    return _fitted(WAVES, values, known.astype(float))[0]
+
+
+def _fitted(form: Array, values: Array, area: Array) -> tuple[Array, float]:
+    """Return the coefficients (P,) of a linear form (N, P) of the values (N,), and the scale of the residual.
+
+    By iteratively reweighted least squares; `area` is the weight (N,) of the values, 0 for unknown ones.
+    """
+    weight, scale = area, 1.0
+    found: Array = np.zeros(form.shape[1])
     for _ in range(ROUNDS):
-        weighted = base * weight[:, None]
-        found = np.linalg.solve(weighted.T @ base + 1e-9 * np.eye(3), weighted.T @ y)
-        off = y - base @ found
-        scale = max(1.4826 * float(np.median(np.abs(off))), 1.0)
-        weight = 1.0 / (1.0 + (off / (2 * scale)) ** 2)
-    return np.asarray(found)
+        weighted = form * weight[:, None]
+        found = np.asarray(np.linalg.solve(weighted.T @ form + 1e-9 * np.eye(form.shape[1]), weighted.T @ values))
+        off = values - form @ found
+        scale = max(1.4826 * float(np.median(np.abs(off[area > 0]))), 1.0)
+        weight = area / (1.0 + (off / (2 * scale)) ** 2)
+    return found, scale

@@ -80,7 +80,7 @@ def test_a_height_between_both_states_or_measured_badly_is_not_answered(
     cap, patch = BUTTON.cap, seen_aslant(BUTTON.height_m, cap=90, ring=20)
     assert cap is not None
     way_m = cap.pressed_depth_m
-    measured = CapHeight(height_m=cap.height_m - way_m / 2 + above * way_m, sigma_m=sigma * way_m, found=1.0)
+    measured = CapHeight(height_m=cap.height_m - way_m / 2 + above * way_m, sigma_m=sigma * way_m)
     monkeypatch.setattr(button, "cap_height", lambda *_, **__: measured)
     assert read_button(patch, BUTTON).state == state
 

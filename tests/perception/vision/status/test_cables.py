@@ -20,7 +20,7 @@ from perception.vision.status.digit_grid import DigitGrid
 from perception.vision.status.gauge import read_gauge, status_of_pointer
 from perception.vision.status.lamp import read_lamp
 from perception.vision.status.lever import read_lever
-from perception.vision.status.occluder_bands import cables_across, lying_across
+from perception.vision.status.occluder_bands import cables_across
 from perception.vision.status.panel_meter import RIVAL, SIGMA_RAD
 from perception.vision.status.pointer import PointerFit
 from perception.vision.status.slider import read_slider
@@ -76,33 +76,6 @@ def test_a_pointer_beside_a_cable_is_read(value: float, xs: tuple[int, int, int]
     assert status.value is None or status.value == pytest.approx(value, abs=0.2)
     if xs[1] != 112:  # that cable is over the pivot, so a refusal is right
         assert status.answered
-
-
-def test_a_bent_cable_is_masked_and_little_else() -> None:
-    xs = (150, 185, 140)
-    drawn = hung(np.zeros((SIZE, SIZE), np.uint8), xs, 1) > 0
-    found = lying_across(
-        patch_of(hung(dark_face(3.0), xs, 85)), half_width_m=RADIUS_M, half_height_m=RADIUS_M, is_round=True
-    )
-    assert found is not None
-    v, u = np.indices(found.shape)
-    face = np.hypot(u - MIDDLE, v - MIDDLE) < 0.95 * RADIUS_M * PX_PER_M
-    assert found[drawn & face].mean() > 0.95 and found[face].mean() < 2.0 * drawn[face].mean()
-
-
-@pytest.mark.parametrize("knee", [(85, 125), (95, 95), (100, 150)])
-def test_a_thick_bent_cable_is_masked_to_its_edges(knee: tuple[int, int]) -> None:
-    """A strip of the cable beside the mask could be taken for a pointer."""
-    cable = np.zeros((SIZE, SIZE), np.uint8)
-    cv2.polylines(cable, [np.array([[-5, 60], knee, [100, SIZE + 5]])], False, 1, 36, cv2.LINE_8)
-    picture = np.full((SIZE, SIZE), 170, np.uint8)
-    cv2.circle(picture, (MIDDLE, MIDDLE), round(RADIUS_M * PX_PER_M), 225, -1, cv2.LINE_AA)
-    picture[cable > 0] = 20
-    found = lying_across(patch_of(picture), half_width_m=RADIUS_M, half_height_m=RADIUS_M, is_round=True)
-    assert found is not None
-    v, u = np.indices(found.shape)
-    face = np.hypot(u - MIDDLE, v - MIDDLE) < 0.95 * RADIUS_M * PX_PER_M
-    assert found[(cable > 0) & face].mean() > 0.97 and found[face & (cable == 0)].mean() < 0.12
 
 
 def test_a_pointer_of_an_uncertain_direction_is_refused() -> None:

@@ -236,23 +236,12 @@ def slant_energies(uprights: Float32, slants: Array) -> Array:
     return energies
 
 
-@compiled
 def row_scores(profile: Array, heights: Array, step: float) -> Array:
     """Return score, top and height (N, 3) of digits: much flat ink in the segments' rows and little between them."""
-    rows = len(profile)
-    found = np.zeros((len(heights) * (int(rows / step) + 1), 3))
-    n = 0
-    at = np.zeros(5)
+    rows, found = len(profile), []
     for height in heights:
-        top = 0.02 * rows
-        while top < 0.98 * rows - height:
-            for k in range(5):
-                y = top + 0.25 * k * height
-                i = min(int(y), rows - 2)
-                at[k] = profile[i] + (y - i) * (profile[i + 1] - profile[i])
-            least = min(at[0], at[2], at[4])
-            score = at[0] + at[2] + at[4] + 2.0 * least - 1.2 * (at[1] + at[3])
-            found[n, 0], found[n, 1], found[n, 2] = score, top, height
-            n += 1
-            top += step
-    return found[:n]
+        tops = np.arange(0.02 * rows, 0.98 * rows - height, step)
+        at = np.interp(tops + 0.25 * height * np.arange(5)[:, None], np.arange(rows), profile)
+        scores = at[::2].sum(axis=0) + 2.0 * at[::2].min(axis=0) - 1.2 * (at[1] + at[3])
+        found.append(np.column_stack([scores, tops, np.full(len(tops), height)]))
+    return np.concatenate(found)

@@ -24,7 +24,7 @@ from perception.vision.status.digit_grid_worth import Float32, apartness
 from perception.vision.status.glyphs import CLOSE, LEAST_SEEN, LIT, NAMES, Number, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink, without_border
 from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
-from perception.vision.status.occluder_bands import hidden_by_bands
+from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.reader import Hints, Reader
 from perception.vision.status.stray import leaves_out, stray_ink
 
@@ -84,11 +84,11 @@ def read_display(
     """
     rows, columns = _window(patch, spec)
     gray, inside = patch.gray[rows, columns], patch.inside[rows, columns]
-    hidden = hidden_by_bands(
-        patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, dark_ink=spec.style == "lcd"
+    dark = spec.style == "lcd"
+    hidden = lying_across(
+        patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False, is_window=True
     )
     hidden = ~inside if hidden is None else hidden[rows, columns] | ~inside
-    dark = spec.style == "lcd"
     seen = float((~hidden & (dark | (gray < 250))).mean()) if gray.size else 0.0
     if seen < 0.5:
         return refused(
@@ -96,7 +96,7 @@ def read_display(
         )
     return read_window(
         gray, digits=spec.digits if digits_taught else None, decimals=spec.decimals if digits_taught else None,
-        dark=spec.style == "lcd", unit=spec.unit, limits=(spec.minimum, spec.maximum), hidden=hidden, before=before,
+        dark=dark, unit=spec.unit, limits=(spec.minimum, spec.maximum), hidden=hidden, before=before,
         bare=True,
     )  # fmt: skip
 
@@ -246,16 +246,9 @@ def _explained(ink: Float32, grid: DigitGrid, lit_levels: Array) -> float:
 
 
 def _answer(
-    found: Decoded,
-    point: DecimalPoint | None,
-    unit: str,
-    decimals: int | None,
-    limits: tuple[float, float] | None,
-    before: float | None,
-    *,
-    covered: bool,
-    bare: bool,
-) -> PatchReading:
+    found: Decoded, point: DecimalPoint | None, unit: str, decimals: int | None, limits: tuple[float, float] | None,
+    before: float | None, *, covered: bool, bare: bool,
+) -> PatchReading:  # fmt: skip
     """Return the likeliest number within the range, or a refusal with its reason."""
     texts = [(_with_point(n.characters, point, decimals), n.log_likelihood) for n in found.listed]
     valued = [(text, value, score) for text, score in texts if (value := _value(text)) is not None]

@@ -20,8 +20,7 @@ from perception.vision.status.display import read_window
 from perception.vision.status.glyphs import LIT, NAMES, Levels, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink
 from perception.vision.status.levels import segment_levels, with_hidden_ends
-from perception.vision.status.occluder_bands import hidden_by_bands
-from perception.vision.status.occluders import ring_medians
+from perception.vision.status.occluder_bands import lying_across
 from tests.perception.vision.status.test_display import window
 
 
@@ -118,14 +117,6 @@ def test_neighbours_that_share_an_upright_count_less() -> None:
     assert (np.diff(factors) >= 0).all() and factors[0] < 0.5 and factors[-1] == 1.0
 
 
-@pytest.mark.parametrize("size", [9, 31, 97])
-def test_sliding_medians_of_a_ring_are_its_medians(size: int) -> None:
-    values = np.random.default_rng(size).integers(0, 256, 97).astype(np.uint8)
-    around = np.pad(values, size // 2, mode="wrap")
-    wanted = [np.median(around[k : k + size]) for k in range(len(values))]
-    assert ring_medians(values, size).tolist() == wanted
-
-
 def in_glare(gray: np.ndarray, added: float) -> np.ndarray:
     """Return the window with a glare at its right end, added in linear light."""
     columns = np.arange(gray.shape[1]) / gray.shape[1]
@@ -212,7 +203,7 @@ def plate_patch(*, cable: tuple[int, int] | None, cable_gray: int = 60) -> Patch
 @pytest.mark.parametrize("cable", [(100, 100), (60, 95), (150, 120)])
 def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int], gray: int) -> None:
     patch = plate_patch(cable=cable, cable_gray=gray)
-    found = hidden_by_bands(patch, half_width_m=0.07, half_height_m=0.03, dark_ink=False)
+    found = lying_across(patch, half_width_m=0.07, half_height_m=0.03, is_round=False, is_window=True)
     assert found is not None
     drawn = np.zeros(found.shape, np.uint8)
     cv2.line(drawn, (cable[0], -5), (cable[1], 115), 1, 8)
@@ -225,13 +216,18 @@ def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int], gray: int) -> N
 def test_a_cable_in_a_dark_picture_is_masked_too() -> None:
     bright = plate_patch(cable=(60, 95))
     dark = replace(bright, gray=(bright.gray * 0.35).astype(np.uint8))
-    masks = [hidden_by_bands(p, half_width_m=0.07, half_height_m=0.03, dark_ink=False) for p in (bright, dark)]
+    masks = [
+        lying_across(p, half_width_m=0.07, half_height_m=0.03, is_round=False, is_window=True) for p in (bright, dark)
+    ]
     assert masks[0] is not None and masks[1] is not None
     assert (masks[0] & masks[1]).sum() > 0.85 * (masks[0] | masks[1]).sum()
 
 
 def test_nothing_is_masked_without_a_cable() -> None:
-    assert hidden_by_bands(plate_patch(cable=None), half_width_m=0.07, half_height_m=0.03, dark_ink=False) is None
+    assert (
+        lying_across(plate_patch(cable=None), half_width_m=0.07, half_height_m=0.03, is_round=False, is_window=True)
+        is None
+    )
 
 
 @pytest.mark.parametrize("level", ["easy", "medium"])

@@ -79,11 +79,8 @@ def _low(stations: Array, quantile: float) -> Array:
     It is smoother than the quantile itself.
     """
     ordered = np.sort(stations, axis=1)  # NaN (unknown) sorts last
-    if not np.isnan(ordered[:, -1]).any():
-        top = max(2, round(stations.shape[1] * 2 * quantile))
-        return np.asarray(ordered[:, :top].mean(axis=1))
     count = np.count_nonzero(~np.isnan(ordered), axis=1)
-    top = np.clip(np.round(count * 2 * quantile), 2, None).astype(int)
-    first = np.arange(stations.shape[1]) < np.minimum(top, count)[:, None]
-    mean = np.where(first, np.nan_to_num(ordered), 0.0).sum(axis=1) / np.maximum(np.minimum(top, count), 1)
+    top = np.minimum(np.maximum(np.round(count * 2 * quantile), 2), count)
+    first = np.arange(stations.shape[1]) < top[:, None]
+    mean = np.where(first, ordered, 0.0).sum(axis=1) / np.maximum(top, 1)
     return np.where(count >= LEAST_KNOWN * stations.shape[1], mean, 0.0)

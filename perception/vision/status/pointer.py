@@ -193,24 +193,14 @@ def _hidden(
 
 def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: float) -> Array:
     """Return the mean of every column between two quantiles of the visible values; 0 if most of it is hidden."""
-    if not hidden.any():
-        first, last = _between(np.array(len(columns)), low, high)
-        return np.asarray(np.sort(columns, axis=0)[int(first) : int(last)].mean(axis=0), float)
     ordered = np.sort(np.where(hidden, np.inf, columns), axis=0)
     known = np.isfinite(ordered)
     count = known.sum(axis=0)
-    total = np.vstack([np.zeros(columns.shape[1]), np.cumsum(np.where(known, ordered, 0.0), axis=0)])
-    first, last = _between(count, low, high)
-    last = last.clip(max=len(columns))
-    at = np.arange(columns.shape[1])
-    mean = (total[last, at] - total[first, at]) / (last - first)
-    return np.where(count >= 0.5 * len(columns), mean, 0.0)
-
-
-def _between(count: NDArray[np.int64], low: float, high: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first and last rank between two quantiles of `count` values, at least two ranks."""
     first = (low * count).astype(int)
-    return first, np.maximum(first + 2, np.round(high * count).astype(int))
+    last = np.maximum(first + 2, np.round(high * count).astype(int))  # at least two ranks
+    rank = np.arange(len(columns))[:, None]
+    mean = np.where((rank >= first) & (rank < last) & known, ordered, 0.0).sum(axis=0, dtype=float) / (last - first)
+    return np.where(count >= 0.5 * len(columns), mean, 0.0)
 
 
 def _angles(patch: Patch, outer_m: float, limits_rad: tuple[float, float] | None) -> Array:

@@ -1,12 +1,13 @@
-"""Compiled fit of a pointer's axis through its ink: theta(r) = theta0 + e / r, with e the pivot's lateral offset."""
+"""Fit of a pointer's axis through its ink: theta(r) = theta0 + e / r, with e the pivot's lateral offset."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array
-from hal.jit import compiled, inlined
+from hal.jit import compiled
 
 # Largest ratio of a row's ink to this percentile of all rows; numerals and ticks may be beside half of the rows.
 NUMERAL, PLAIN = 1.8, 35.0
@@ -16,57 +17,6 @@ ROUNDS, WEIGHINGS = 3, 5
 LEAST_ROWS = 3
 BESIDE = 2  # columns around hidden ones, whose blur affects them
 PIVOTS_AT_MOST = 2.0  # largest weight of a row, relative to a typical one
-
-
-@inlined
-def row_centres(
-    ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: Array, half: Array
-) -> tuple[Array, Array, Array]:
-    """Return the centre of the ink (rad), its mass and its width (rad) in every row, within `half` of `middle`.
-
-    (rows,) each. A pointer has one gray: rows with much stronger ink belong to a numeral or a tick beside it. If the
-    ink continues under an occluder, its visible centre is not the pointer's centre, so the row is dropped.
-
-    Args:
-        ink, hidden: (rows, angles).
-        offset: (angles,) rad.
-        middle, half: (rows,) rad.
-    """
-    rows, columns = ink.shape
-    top = np.zeros(rows)
-    for i in range(rows):
-        for j in range(columns):
-            if abs(offset[j] - middle[i]) < half[i]:
-                top[i] = max(top[i], ink[i, j])
-    most = NUMERAL * np.percentile(top[top > 0.0], PLAIN) if top.max() > 0.0 else 0.0
-    step = abs(offset[1] - offset[0])
-    centre, mass, width = np.zeros(rows), np.zeros(rows), np.zeros(rows)
-    for i in range(rows):
-        if top[i] <= 0.0 or top[i] > most or _goes_under(ink[i], hidden[i], offset, middle[i], half[i], top[i]):
-            continue
-        moment = 0.0
-        for j in range(columns):
-            if abs(offset[j] - middle[i]) < half[i]:
-                over = max(ink[i, j] - HALF_LEVEL * top[i], 0.0)
-                mass[i] += over
-                moment += over * offset[j]
-        centre[i] = moment / mass[i]
-        width[i] = mass[i] * step / ((1.0 - HALF_LEVEL) * top[i])
-    return centre, mass, width
-
-
-@inlined
-def _goes_under(
-    ink: NDArray[np.float32], hidden: NDArray[np.bool_], offset: Array, middle: float, half: float, top: float
-) -> bool:
-    """Return whether the relevant ink of a row is adjacent to hidden samples."""
-    columns = len(ink)
-    for j in range(columns):
-        if abs(offset[j] - middle) < half and ink[j] > HALF_LEVEL * top:
-            for k in range(max(0, j - BESIDE), min(columns, j + BESIDE + 1)):
-                if hidden[k]:
-                    return True
-    return False
 
 
 @compiled
@@ -92,20 +42,14 @@ def fitted_line(r: Array, theta: Array, mass: Array, e_sigma: float, least_m: fl
     return theta0, e, variance
 
 
-@compiled
 def pointer_axis(
-    ink: NDArray[np.float32],
-    hidden: NDArray[np.bool_],
-    r: Array,
-    offset: Array,
-    reach_rad: float,
-    e_sigma: float,
-    px_per_m: float,
-) -> tuple[float, float]:
+    ink: NDArray[np.float32], hidden: NDArray[np.bool_], r: Array, offset: Array, reach_rad: float, e_sigma: float, px_per_m: float
+) -> tuple[float, float]:  # fmt: skip
     """Return the angle (rad, as `offset`) of the pointer near offset 0, and its variance; NaN if too few rows have ink.
 
     Things that touch the pointer (a numeral, a tick) widen some rows, so each round searches within the pointer's own
-    width.
+    width. A pointer has one gray: rows with much stronger ink belong to a numeral or a tick beside it. If the ink
+    continues under an occluder, its visible centre is not the pointer's centre, so the row is dropped.
 
     Args:
         ink, hidden: (rows, angles).
@@ -114,14 +58,23 @@ def pointer_axis(
         reach_rad: half width of the search in the first round.
         e_sigma: standard deviation of the pivot's offset, m.
     """
-    middle, half = np.zeros(len(r)), np.full(len(r), reach_rad)
-    theta0, variance = np.nan, np.nan
+    close = np.abs(offset) < 2.0 * reach_rad  # a refined search may reach beyond the first one
+    ink, offset = ink[:, close], offset[close]
+    beside = cv2.dilate(hidden.astype(np.uint8), np.ones((1, 2 * BESIDE + 1), np.uint8))[:, close] > 0
+    near, theta0, variance = np.abs(offset) < reach_rad, np.nan, np.nan
     for _ in range(ROUNDS):
-        theta, mass, width = row_centres(ink, hidden, offset, middle, half)
-        there = mass > 0
+        shown = np.where(near, ink, 0.0)
+        top = shown.max(axis=1, initial=0.0)
+        goes_under = (beside & (shown > HALF_LEVEL * top[:, None])).any(axis=1)
+        if (top > 0.0).any():
+            top = np.where(goes_under | (top > NUMERAL * np.percentile(top[top > 0.0], PLAIN)), 0.0, top)
+        there = top > 0.0
         if there.sum() < LEAST_ROWS:
             return np.nan, np.nan
-        theta0, e, variance = fitted_line(r[there], theta[there], mass[there], e_sigma, 0.15 / px_per_m)
-        half_m = OWN_WIDTH[1] * (np.percentile((width * r)[there], OWN_WIDTH[0]) + 1.0 / px_per_m)
-        middle, half = theta0 + e / r, half_m / r
+        over = np.maximum(shown[there] - HALF_LEVEL * top[there, None], 0.0)
+        mass, at = over.sum(axis=1), r[there]
+        theta0, e, variance = fitted_line(at, over @ offset / mass, mass, e_sigma, 0.15 / px_per_m)
+        width = mass * abs(offset[1] - offset[0]) / ((1.0 - HALF_LEVEL) * top[there])
+        half_m = OWN_WIDTH[1] * (np.percentile(width * at, OWN_WIDTH[0]) + 1.0 / px_per_m)
+        near = np.abs(offset - (theta0 + e / r)[:, None]) < (half_m / r)[:, None]
     return theta0, variance

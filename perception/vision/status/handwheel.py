@@ -100,15 +100,11 @@ def _by_unmarked(patch: Patch, R: float, places: Array, best: int) -> float:
     n, half = len(places), min(STEPS // 12, STEPS // (4 * len(places)))
     spoke = unroll(patch, middle_of(patch, R), np.linspace(0.42, 0.72, 8) * R, 2 * np.pi * np.arange(STEPS) / STEPS)
     ink = _smooth(np.median(np.abs(spoke - _gaps(spoke, n)), axis=0), STEPS // 60)
-    offsets = np.arange(-half, half + 1)
     steps = np.round(np.delete(places, best) / (2 * np.pi) * STEPS).astype(int)
-    windows = ink[(steps[:, None] + offsets) % STEPS]
-    heights = windows.max(axis=1) - np.median(ink)
-    weights = np.maximum(windows - 0.5 * (windows.max(axis=1) + windows.min(axis=1))[:, None], 0.0)
-    moved = (weights * offsets).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9)
-    if heights.min() <= SPOKE_SHARE * heights.max() or np.abs(moved).max() > (MOST_MOVED if n > 2 else half):
+    centres = _centres(ink, steps, half)
+    if centres is None or np.abs(centres - steps).max() > (MOST_MOVED if n > 2 else half):
         return float(places[best])
-    exact = (steps + moved) * 2 * np.pi / STEPS - np.delete(places, best)
+    exact = centres * 2 * np.pi / STEPS - np.delete(places, best)
     return float(places[best] + exact.mean())
 
 
@@ -173,22 +169,29 @@ def _centred(ink: Array, phase: float, n: int) -> float:
     the fold only has what most of them share. A shift of 1 mm is 3 degrees at the spokes' middle. A cable or a shadow
     shifts only one spoke, or shifts it farther.
     """
-    period = STEPS / n
-    half = round(period / 4)
-    offsets = np.arange(-half, half + 1)
-    places = np.round(phase + period * np.arange(n)).astype(int)
-    windows = ink[(places[:, None] + offsets) % STEPS]
-    heights = windows.max(axis=1) - np.median(ink)
-    if heights.min() <= SPOKE_SHARE * heights.max():
+    wanted = phase + STEPS / n * np.arange(n)
+    places = np.round(wanted).astype(int)
+    centres = _centres(ink, places, round(STEPS / n / 4))
+    if centres is None:
         return phase
-    weights = np.maximum(windows - 0.5 * (windows.max(axis=1) + windows.min(axis=1))[:, None], 0.0)
-    moved = places + (weights * offsets).sum(axis=1) / weights.sum(axis=1) - phase - period * np.arange(n)
+    moved = centres - wanted
     angles = 2 * np.pi * places / STEPS
     J = np.column_stack([np.ones(n), np.sin(angles), np.cos(angles)])
     unlike = moved - J @ np.linalg.lstsq(J, moved, rcond=None)[0]
     if np.abs(moved).max() > MOST_MOVED or np.abs(unlike).max() > MOST_UNLIKE:
         return phase
     return phase + float(moved.mean())
+
+
+def _centres(ink: Array, steps: NDArray[np.int64], half: int) -> Array | None:
+    """Return the centres of mass (steps) of the spokes within `half` of some steps; None if one is much fainter than others."""
+    offsets = np.arange(-half, half + 1)
+    windows = ink[(steps[:, None] + offsets) % STEPS]
+    heights = windows.max(axis=1) - np.median(ink)
+    if heights.min() <= SPOKE_SHARE * heights.max():
+        return None
+    weights = np.maximum(windows - 0.5 * (windows.max(axis=1) + windows.min(axis=1))[:, None], 0.0)
+    return np.asarray(steps + (weights * offsets).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-9))
 
 
 def _at(mark: NDArray[np.float32], angle: float) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array
 from hal.panel import Lever
@@ -17,10 +17,10 @@ from perception.vision.status.choice import choose, contrast_noise
 from perception.vision.status.occluder_bands import cables_across
 from perception.vision.status.reader import Reader
 
-BAR_FROM, BAR_TO = 0.40, 0.92  # share of the length: outside the hub, inside the tip
+BAR = (0.40, 0.92)  # share of the length: outside the hub, inside the tip
 FLANK = (1.35, 1.6)  # in half widths; pipes and flanges are close by
-BESIDE = np.linspace(-1.5, 1.5, 13)  # in half widths; a shadow falls to one side
-SHADOW_SHARE = 0.4  # width of the bar's shadow, as a share of the bar's width
+BESIDE = np.linspace(-0.75, 0.75, 13)  # in widths; a shadow falls to one side
+WIDE_OR_SHADOW = (1.0, 0.4)  # widths of the bar and of its shadow, over the bar's width
 CLEAR_OF_TIP = 1.25  # in lengths; pipes usually end within this radius too
 BEYOND = (1.12, 1.30)  # in lengths: clear of the tip, and still in the patch
 ASIDE = (-0.5, 0.0, 0.5)  # in widths: places where the bar may continue
@@ -40,7 +40,7 @@ def read_lever(patch: Patch, spec: Lever) -> PatchReading:
     gradients.
     """
     angles = np.array([state.angle_rad for state in spec.states])
-    r = np.linspace(BAR_FROM, BAR_TO, 8)[:, None] * spec.length_m
+    r = np.linspace(*BAR, 8)[:, None] * spec.length_m
     seen = patch.seen(r * np.sin(angles), r * np.cos(angles))
     status, nominal, hidden = _direction(patch, spec, seen)
     if not status.answered:
@@ -62,14 +62,10 @@ def read_lever(patch: Patch, spec: Lever) -> PatchReading:
 
 def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[PatchReading, float, NDArray[np.bool_] | None]:
     """Return the state whose bar has the most contrast, its direction, and the mask of occluders."""
-    L = spec.length_m
     angles = np.array([state.angle_rad for state in spec.states])
     tried = (angles[:, None] + WOBBLE_RAD).ravel()
-    hidden = cables_across(patch, radius_m=CLEAR_OF_TIP * L, own_rad=angles)
-    contrast = bar_contrast(
-        patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK, hidden=hidden
-    )
-    contrast = _that_ends(patch, spec, tried, contrast, hidden)
+    hidden = cables_across(patch, radius_m=CLEAR_OF_TIP * spec.length_m, own_rad=angles)
+    contrast = _that_ends(patch, spec, tried, _bar(patch, spec, tried, hidden=hidden), hidden)
     evidence = np.abs(contrast).reshape(len(angles), -1).max(axis=1)
     status = choose([s.name for s in spec.states], evidence, noise=contrast_noise(patch), seen=seen, what="lever")
     return status, float(angles[int(np.argmax(evidence))]), hidden
@@ -89,19 +85,18 @@ def _that_ends(
 
     A handle ends there, a cable does not.
     """
-    L, noise = spec.length_m, contrast_noise(patch)
+    noise = contrast_noise(patch)
     shows = np.abs(contrast) > 1.5 * noise  # weaker contrasts are no evidence
     if not shows.any():
         return contrast
     lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # outside the image, its border is repeated
-    goes_on = np.stack([
-        bar_contrast(
-            patch, angles_rad[shows], along_m=(BEYOND[0] * L, BEYOND[1] * L), half_width_m=half_width_m, quantile=0.5,
-            flank=FLANK, beside_m=share * spec.width_m, hidden=lost if lost.any() else None,
-        )
-        for half_width_m in (spec.width_m / 2, SHADOW_SHARE * spec.width_m / 2)
-        for share in ASIDE
-    ])  # fmt: skip
+    goes_on = np.stack(
+        [
+            _bar(patch, spec, angles_rad[shows], along=BEYOND, wide=wide, beside=aside, quantile=0.5, hidden=lost)
+            for wide in WIDE_OR_SHADOW
+            for aside in ASIDE
+        ]
+    )
     sign = np.sign(contrast[shows])
     like = np.maximum(goes_on * sign - noise, 0.0).max(axis=0)
     out = contrast.copy()
@@ -115,30 +110,28 @@ def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:
     A handle as gray as the plate is visible only by the shadow along its side; a handle between two states is not
     parallel.
     """
-    along_m = (BAR_FROM * spec.length_m, BAR_TO * spec.length_m)
-    turned = parallel = 0.0
-    for half_width_m in (spec.width_m / 2, SHADOW_SHARE * spec.width_m / 2):
-        across = bar_contrast(patch, nominal + SWEEP_RAD, along_m=along_m, half_width_m=half_width_m, flank=FLANK)
-        turned = max(turned, float(np.abs(across).max()))
-        for beside_m in BESIDE * spec.width_m / 2:
-            line = bar_contrast(
-                patch, nominal, along_m=along_m, half_width_m=half_width_m, flank=FLANK, beside_m=float(beside_m)
-            )
-            parallel = max(parallel, abs(float(line[0])))
-    return parallel > turned
+    turned = max(float(np.abs(_bar(patch, spec, nominal + SWEEP_RAD, wide=wide)).max()) for wide in WIDE_OR_SHADOW)
+    lines = (_bar(patch, spec, nominal, wide=wide, beside=beside) for wide in WIDE_OR_SHADOW for beside in BESIDE)
+    return max(abs(float(line[0])) for line in lines) > turned
 
 
 def _bar_angle(patch: Patch, spec: Lever, nominal: float, hidden: NDArray[np.bool_] | None) -> float:
     """Return the direction near a state's nominal angle in which the bar has the most contrast."""
-    L = spec.length_m
     tried = nominal + SWEEP_RAD
-    contrast = np.abs(
-        bar_contrast(
-            patch, tried, along_m=(BAR_FROM * L, BAR_TO * L), half_width_m=spec.width_m / 2, flank=FLANK, hidden=hidden
-        )
-    )
-    smooth = np.convolve(contrast, np.ones(5) / 5.0, "same")
+    smooth = np.convolve(np.abs(_bar(patch, spec, tried, hidden=hidden)), np.ones(5) / 5.0, "same")
     return float(tried[2 + int(np.argmax(smooth[2:-2]))])
+
+
+def _bar(
+    patch: Patch, spec: Lever, angles_rad: ArrayLike, *, along: tuple[float, float] = BAR, wide: float = 1.0, beside: float = 0.0,
+    quantile: float = 0.3, hidden: NDArray[np.bool_] | None = None,
+) -> Array:  # fmt: skip
+    """Return the contrasts (N,) of a bar between two shares of the lever's length; `wide` and `beside` in the lever's widths."""
+    first_m, last_m = (share * spec.length_m for share in along)
+    return bar_contrast(
+        patch, angles_rad, along_m=(first_m, last_m), half_width_m=wide * spec.width_m / 2, quantile=quantile, flank=FLANK,
+        beside_m=beside * spec.width_m, hidden=hidden,
+    )  # fmt: skip
 
 
 READER = Reader[Lever](read=read_lever, guesses_right=0.45)

@@ -19,10 +19,8 @@ BEYOND = (1.5, 3.0)  # in bat radii past its tip, outside its round end
 BEHIND = (0.8, 1.7)  # in bat radii behind the foot, not yet at the nut
 GOES_ON = 3.0  # weight of the contrast beyond the ends, which may be weaker there
 PIVOT_M = 0.004  # height above the plate of the point about which a bat turns
-FLANK, WIDE_FLANK = (
-    (1.6, 1.9),
-    (2.3, 2.6),
-)  # distances from the axis of the stripes that are compared with the bat, over 0.8 of its radius
+# Distances from the axis of the stripes that are compared with the bat, over 0.8 of its radius.
+FLANK, WIDE_FLANK = (1.6, 1.9), (2.3, 2.6)
 AT_FOOT = (0.15, 0.5)  # share of the length in which a bat as gray as the plate contrasts with the nut around its foot
 #: Places of the bat's axis beside the one of the registered panel, in bat radii. Where few edges of the panel are in view,
 #: its registered pose is wrong by as much, and there the other side of the nut looked like a bat.
@@ -83,12 +81,7 @@ def _at_foot(patch: Patch, spec: Toggle, noise: float, aside_m: float) -> Array:
 
 
 def _stretch(
-    patch: Patch,
-    spec: Toggle,
-    angle_rad: float,
-    along: tuple[float, float],
-    flank: tuple[float, float],
-    aside_m: float,
+    patch: Patch, spec: Toggle, angle_rad: float, along: tuple[float, float], flank: tuple[float, float], aside_m: float
 ) -> float:
     """Return the signed contrast of a stretch of a bat that leans towards an angle.
 
@@ -111,7 +104,6 @@ def _bat(patch: Patch, spec: Toggle, angle_rad: float, flank: tuple[float, float
     other position if the view runs along both.
     """
     reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
-
     bat = _stretch(patch, spec, angle_rad, (BAT_FROM, BAT_TO), flank, aside_m)
     foot, tip = (
         np.array(patch.pixel_of(k * reach * np.sin(angle_rad), k * reach * np.cos(angle_rad), PIVOT_M + k * height))

@@ -23,7 +23,7 @@ BESIDE = np.linspace(-0.75, 0.75, 13)  # in widths; a shadow falls to one side
 WIDE_OR_SHADOW = (1.0, 0.4)  # widths of the bar and of its shadow, over the bar's width
 CLEAR_OF_TIP = 1.25  # in lengths; pipes usually end within this radius too
 BEYOND = (1.12, 1.30)  # in lengths: clear of the tip, and still in the patch
-ASIDE = (-0.5, 0.0, 0.5)  # in widths: places where the bar may continue
+ASIDE = (-0.5, 0.0, 0.5)  # in widths: places where a cable may continue
 GOES_ON = 2.0  # weight of the contrast beyond the tip; a flange or a pipe's end sometimes lies there
 SWEEP_RAD = np.deg2rad(np.arange(-30.0, 30.5, 1.0))
 BETWEEN_RAD = 0.16  # a quarter-turn valve 9 degrees away from its stop is neither open nor closed
@@ -65,9 +65,12 @@ def _direction(patch: Patch, spec: Lever, seen: float) -> tuple[PatchReading, fl
     angles = np.array([state.angle_rad for state in spec.states])
     tried = (angles[:, None] + WOBBLE_RAD).ravel()
     hidden = cables_across(patch, radius_m=CLEAR_OF_TIP * spec.length_m, own_rad=angles)
-    contrast = _that_ends(patch, spec, tried, _bar(patch, spec, tried, hidden=hidden), hidden)
-    evidence = np.abs(contrast).reshape(len(angles), -1).max(axis=1)
-    status = choose([s.name for s in spec.states], evidence, noise=contrast_noise(patch), seen=seen, what="lever")
+    contrast, noise = _bar(patch, spec, tried, hidden=hidden), contrast_noise(patch)
+    lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # outside the image, its border is repeated
+    beyond = [_bar(patch, spec, tried, along=BEYOND, beside=aside, quantile=0.5, hidden=lost) for aside in ASIDE]
+    goes_on = np.maximum(np.sign(contrast) * beyond - noise, 0.0).max(axis=0)  # a handle ends there, a cable does not
+    evidence = np.maximum(np.abs(contrast) - GOES_ON * goes_on, 0.0).reshape(len(angles), -1).max(axis=1)
+    status = choose([s.name for s in spec.states], evidence, noise=noise, seen=seen, what="lever")
     return status, float(angles[int(np.argmax(evidence))]), hidden
 
 
@@ -76,32 +79,6 @@ def _flattened(patch: Patch, spec: Lever) -> Patch:
     gray = patch.gray.astype(np.float32)
     light = cv2.GaussianBlur(gray, (0, 0), LIGHT_SIGMA * spec.width_m * patch.px_per_m)
     return replace(patch, gray=np.clip(np.round(gray - light + MIDDLE_GRAY), 0, 255).astype(np.uint8))
-
-
-def _that_ends(
-    patch: Patch, spec: Lever, angles_rad: Array, contrast: Array, hidden: NDArray[np.bool_] | None
-) -> Array:
-    """Return the contrasts (N,) of bars minus that of their continuation beyond the tips.
-
-    A handle ends there, a cable does not.
-    """
-    noise = contrast_noise(patch)
-    shows = np.abs(contrast) > 1.5 * noise  # weaker contrasts are no evidence
-    if not shows.any():
-        return contrast
-    lost = ~patch.inside if hidden is None else hidden | ~patch.inside  # outside the image, its border is repeated
-    goes_on = np.stack(
-        [
-            _bar(patch, spec, angles_rad[shows], along=BEYOND, wide=wide, beside=aside, quantile=0.5, hidden=lost)
-            for wide in WIDE_OR_SHADOW
-            for aside in ASIDE
-        ]
-    )
-    sign = np.sign(contrast[shows])
-    like = np.maximum(goes_on * sign - noise, 0.0).max(axis=0)
-    out = contrast.copy()
-    out[shows] = sign * np.maximum(np.abs(contrast[shows]) - GOES_ON * like, 0.0)
-    return out
 
 
 def _is_parallel(patch: Patch, spec: Lever, nominal: float) -> bool:

@@ -29,8 +29,6 @@ SPOT_TO = 0.46  # in radii: glare from beside the cap is brightest farther out
 CLEAR_OF_RING = 1.4  # in radii: anything that crosses a circle of this size does not belong to the button
 BLUR_PX = 2.0  # px by which an occluder's blur extends beyond its mask
 LEAST_RING, LEAST_FACE = 0.4, 0.5  # share that must be visible
-# The plate beside a cap is uniform except for occluders: limits in noise sigmas and as a share of its gray
-ODD_SIGMAS, ODD_SHARE = 4.0, 0.12
 HEADROOM = 0.2  # share of the plate's gray left above a face: with less, no highlight can show
 SMOOTH = 0.01  # share of the plate's gray by which a face may deviate from the smooth model
 ROUNDS = 4
@@ -74,10 +72,7 @@ def cap_shades(patch: Patch, radius_m: float) -> Shades:
     if no_plate.mean() > 1.0 - LEAST_RING:
         return Shades(shade=np.nan, spot=spot, below=below)
     around = _wave(plate, ~no_plate)
-    off = WAVES @ around - plate
-    noise = max(1.4826 * float(np.median(np.abs(off[~no_plate]))), 1.0)
-    odd = no_plate | no_ring | (off > max(ODD_SIGMAS * noise, ODD_SHARE * level))
-    odd = odd | np.roll(odd, 1) | np.roll(odd, -1)
+    odd = no_plate | no_ring
     if odd.mean() > 1.0 - LEAST_RING:
         return Shades(shade=np.nan, spot=spot, below=below)
     within = around if no_rim.mean() > LEAST_FACE else _wave(rim, ~no_rim)

@@ -23,7 +23,7 @@ from perception.vision.status.digit_grid import DigitGrid, find_digit_grids
 from perception.vision.status.digit_grid_worth import Float32, apartness
 from perception.vision.status.glyphs import CLOSE, LEAST_SEEN, LIT, NAMES, Number, likelihoods, numbers, separate
 from perception.vision.status.ink import segment_ink, without_border
-from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends
+from perception.vision.status.levels import loop_levels, segment_levels, with_hidden_ends, without_frames
 from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.reader import Hints, Reader
 from perception.vision.status.stray import leaves_out, stray_ink
@@ -86,7 +86,7 @@ def read_display(
     gray, inside = patch.gray[rows, columns], patch.inside[rows, columns]
     dark = spec.style == "lcd"
     hidden = lying_across(
-        patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False, is_window=True
+        patch, half_width_m=spec.width_m / 2, half_height_m=spec.height_m / 2, is_round=False, dark_ink=dark
     )
     hidden = ~inside if hidden is None else hidden[rows, columns] | ~inside
     seen = float((~hidden & (dark | (gray < 250))).mean()) if gray.size else 0.0
@@ -193,7 +193,7 @@ def decode(ink: Float32, seen: Float32, grid: DigitGrid, *, all_cells: bool = Fa
         all_cells: whether the grid's last cell is the display's last; otherwise blank cells at its end are not counted.
     """
     segments, shares = segment_levels(ink, seen, grid)
-    levels = separate(segments, shares, *loop_levels(ink, seen, grid))
+    levels = separate(without_frames(ink, grid, segments), shares, *loop_levels(ink, seen, grid))
     if levels is None:
         return None
     characters, blank = likelihoods(levels)

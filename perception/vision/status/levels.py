@@ -9,12 +9,15 @@ import numpy as np
 from hal.arrays import Array
 from perception.vision.patch import sample_at
 from perception.vision.status.digit_grid import AXES, DigitGrid
-from perception.vision.status.digit_grid_worth import FLAT, INNER, STROKE, Float32
+from perception.vision.status.digit_grid_worth import BEYOND, FLAT, INNER, STROKE, Float32
 
 ALONG = np.linspace(INNER, 1.0 - INNER, 5)[:, None, None]  # places along a segment's axis
-ACROSS = 0.8 * STROKE * np.array([-1.0, 0.0, 1.0])  # places across the axis, in digit heights
+ACROSS = (
+    0.8 * STROKE * np.arange(-2.0, 3.0)
+)  # places across an upright, in digit heights; across a segment those within
 CLEAR = 0.6  # visibility of a pixel that counts as visible
 WHOLLY_SEEN = 0.5  # least visible share over all segments of a cell that counts as wholly visible
+FRAME_LEVEL = 0.5  # share of an upright's level: ink above and below it that exceeds this makes it a frame's side
 LEAST_LOOP_PLACES = 6
 LOOP_X, LOOP_Y = np.meshgrid(np.linspace(0.36, 0.64, 3), [0.2, 0.25, 0.3, 0.7, 0.75, 0.8])
 
@@ -25,7 +28,7 @@ def segment_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array,
     The level is the median along the segment's axis of the maximum across its stroke.
     """
     x, y = np.moveaxis(AXES[:, 0] + ALONG * (AXES[:, 1] - AXES[:, 0]), 2, 0)[..., None]
-    across = ACROSS * grid.height_px
+    across = ACROSS[1:4] * grid.height_px
     u, v = _places(grid, x, y)  # cells, places, segments, 1
     u, v = np.broadcast_arrays(u + np.where(FLAT[:, None], 0.0, across), v + np.where(FLAT[:, None], across, 0.0))
     clear = _at(seen, u, v) > CLEAR
@@ -47,6 +50,17 @@ def loop_levels(ink: Float32, seen: Float32, grid: DigitGrid) -> tuple[Array, Ar
     values = _at(ink, u, v)
     means = (share * values).sum(axis=1)
     return means, np.sqrt((share * (values - means[:, None]) ** 2).sum(axis=1))
+
+
+def without_frames(ink: Float32, grid: DigitGrid, levels: Array) -> Array:
+    """Return the levels (cells, 7) without uprights that continue above and below the digit, as a frame's sides do."""
+    y = np.array([-BEYOND[1], -BEYOND[0], 1.0 + BEYOND[0], 1.0 + BEYOND[1]])[:, None]
+    out = levels.copy()
+    for x, uprights in ((0.0, (5, 4)), (1.0, (1, 2))):
+        u, v = _places(grid, np.full_like(y, x), y)
+        beyond = _at(ink, *np.broadcast_arrays(u + ACROSS * grid.height_px, v)).max(axis=2).min(axis=1)
+        out[:, uprights] *= (beyond <= FRAME_LEVEL * levels[:, uprights].max(axis=1))[:, None]
+    return out
 
 
 def with_hidden_ends(seen: Float32, grid: DigitGrid, most: int) -> DigitGrid:

@@ -32,19 +32,25 @@ MERGED = 1.7  # ratio of the widths of the two ends from which something beside 
 
 
 def lying_across(
-    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, is_window: bool = False,
+    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, dark_ink: bool | None = None,
     through: bool = False,  # noqa: ARG001 - of sliders
 ) -> NDArray[np.bool_] | None:  # fmt: skip
     """Return a mask (H, W) of the cables across an object in the patch; None if there are none.
 
     Args:
         half_width_m, half_height_m, is_round: as for `border_crossings`.
-        is_window: whether the object is a dark window, in which a cable as gray as the plate stands out, too.
+        dark_ink: whether the segments of a display are darker than their background; None for anything else. In its
+            window a cable as gray as the plate stands out, too. The blurred edge of a cable with the polarity of the
+            segments could be taken for ink, so it is hidden widely; the other edges are left visible.
     """
     smooth, inset_m = smoothed(patch), INSET * 2 * min(half_width_m, half_height_m)
     bands = _bands(patch, smooth, half_width_m, half_height_m, is_round=is_round, beyond=OUTSIDE)
-    if is_window:
+    if dark_ink is not None:
         bands += _bands(patch, smooth, half_width_m - inset_m, half_height_m - inset_m, is_round=False, beyond=0.0)
+        x, y = np.meshgrid(np.linspace(-0.8, 0.8, 24) * half_width_m, np.linspace(-0.8, 0.8, 12) * half_height_m)
+        ground = float(np.median(patch.sample(x, y, 0.0)))
+        wider = [INK_EDGE_PX if (band.gray < ground - SAME_GRAY / 2) == dark_ink else -INK_EDGE_PX for band in bands]
+        bands = [replace(band, width_px=band.width_px + by) for band, by in zip(bands, wider, strict=True)]
     return _drawn(bands, patch.gray.shape)
 
 
@@ -143,17 +149,17 @@ def _joined(
     aside = CORE * min(widths) * np.array([-along[1], along[0]])
     u, v = np.stack([axis - aside, axis, axis + aside], axis=1).transpose(2, 0, 1)
     share = float((np.abs(sample_at(smooth, u, v) - wanted) < tolerance).mean())
-    return (
-        _Band(points_px=np.stack([a.middle_px, b.middle_px]), width_px=width, share=share)
-        if share >= ALONG_SHARE
-        else None
-    )
+    if share < ALONG_SHARE:
+        return None
+    ends = np.stack([a.middle_px, b.middle_px])
+    return _Band(points_px=ends, width_px=width, share=share, gray=(a.gray + b.gray) / 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Band:
-    """A cable: the ends (2, 2) of its axis, its width, and the share of it that has its gray."""
+    """A cable: the ends (2, 2) of its axis, its width, the share of it that has its gray, and that gray."""
 
     points_px: Array
     width_px: float
     share: float
+    gray: float

@@ -203,7 +203,7 @@ def plate_patch(*, cable: tuple[int, int] | None, cable_gray: int = 60) -> Patch
 @pytest.mark.parametrize("cable", [(100, 100), (60, 95), (150, 120)])
 def test_a_cable_is_masked_where_it_lies(cable: tuple[int, int], gray: int) -> None:
     patch = plate_patch(cable=cable, cable_gray=gray)
-    found = lying_across(patch, half_width_m=0.07, half_height_m=0.03, is_round=False, is_window=True)
+    found = lying_across(patch, half_width_m=0.07, half_height_m=0.03, is_round=False, dark_ink=False)
     assert found is not None
     drawn = np.zeros(found.shape, np.uint8)
     cv2.line(drawn, (cable[0], -5), (cable[1], 115), 1, 8)
@@ -217,7 +217,7 @@ def test_a_cable_in_a_dark_picture_is_masked_too() -> None:
     bright = plate_patch(cable=(60, 95))
     dark = replace(bright, gray=(bright.gray * 0.35).astype(np.uint8))
     masks = [
-        lying_across(p, half_width_m=0.07, half_height_m=0.03, is_round=False, is_window=True) for p in (bright, dark)
+        lying_across(p, half_width_m=0.07, half_height_m=0.03, is_round=False, dark_ink=False) for p in (bright, dark)
     ]
     assert masks[0] is not None and masks[1] is not None
     assert (masks[0] & masks[1]).sum() > 0.85 * (masks[0] | masks[1]).sum()
@@ -225,7 +225,7 @@ def test_a_cable_in_a_dark_picture_is_masked_too() -> None:
 
 def test_nothing_is_masked_without_a_cable() -> None:
     assert (
-        lying_across(plate_patch(cable=None), half_width_m=0.07, half_height_m=0.03, is_round=False, is_window=True)
+        lying_across(plate_patch(cable=None), half_width_m=0.07, half_height_m=0.03, is_round=False, dark_ink=False)
         is None
     )
 

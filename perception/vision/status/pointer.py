@@ -133,7 +133,7 @@ def find_pointer(patch: Patch, search: PointerSearch, *, cover: NDArray[np.bool_
     offset = wrapped(angles - fit.angle_rad) if wraps else angles - fit.angle_rad
     fine = (radii >= search.fine_m[0]) & (radii <= search.fine_m[1])
     e_sigma = search.pivot_sigma_px / patch.image_px_per_m
-    angle, variance = pointer_axis(ink[fine], radii[fine], offset, REFINE_RAD, e_sigma, patch.px_per_m)
+    angle, variance = pointer_axis(ink[fine], hidden[fine], radii[fine], offset, REFINE_RAD, e_sigma, patch.px_per_m)
     if np.isnan(angle):
         return replace(fit, sigma_rad=ROUGH_SIGMA_RAD)
     return replace(fit, angle_rad=fit.angle_rad + angle, sigma_rad=float(np.sqrt(CORRELATED * variance)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +15,7 @@ HALF_LEVEL = 0.3  # of a row's strongest ink; less belongs to the pointer's blur
 OWN_WIDTH = (35.0, 0.6)  # percentile of the rows' widths, and half width of the next search relative to it
 ROUNDS, WEIGHINGS = 3, 5
 LEAST_ROWS = 3
+BESIDE = 2  # columns around hidden ones, whose blur affects them
 PIVOTS_AT_MOST = 2.0  # largest weight of a row, relative to a typical one
 
 
@@ -41,15 +43,16 @@ def fitted_line(r: Array, theta: Array, mass: Array, e_sigma: float, least_m: fl
 
 
 def pointer_axis(
-    ink: NDArray[np.float32], r: Array, offset: Array, reach_rad: float, e_sigma: float, px_per_m: float
+    ink: NDArray[np.float32], hidden: NDArray[np.bool_], r: Array, offset: Array, reach_rad: float, e_sigma: float, px_per_m: float
 ) -> tuple[float, float]:  # fmt: skip
     """Return the angle (rad, as `offset`) of the pointer near offset 0, and its variance; NaN if too few rows have ink.
 
     Things that touch the pointer (a numeral, a tick) widen some rows, so each round searches within the pointer's own
-    width. A pointer has one gray: rows with much stronger ink belong to a numeral or a tick beside it.
+    width. A pointer has one gray: rows with much stronger ink belong to a numeral or a tick beside it. If the ink
+    continues under an occluder, its visible centre is not the pointer's centre, so the row is dropped.
 
     Args:
-        ink: (rows, angles).
+        ink, hidden: (rows, angles).
         r: (rows,) m.
         offset: (angles,) rad from the rough pointer.
         reach_rad: half width of the search in the first round.
@@ -57,12 +60,14 @@ def pointer_axis(
     """
     close = np.abs(offset) < 2.0 * reach_rad  # a refined search may reach beyond the first one
     ink, offset = ink[:, close], offset[close]
+    beside = cv2.dilate(hidden.astype(np.uint8), np.ones((1, 2 * BESIDE + 1), np.uint8))[:, close] > 0
     near, theta0, variance = np.abs(offset) < reach_rad, np.nan, np.nan
     for _ in range(ROUNDS):
         shown = np.where(near, ink, 0.0)
         top = shown.max(axis=1, initial=0.0)
+        goes_under = (beside & (shown > HALF_LEVEL * top[:, None])).any(axis=1)
         if (top > 0.0).any():
-            top = np.where(top > NUMERAL * np.percentile(top[top > 0.0], PLAIN), 0.0, top)
+            top = np.where(goes_under | (top > NUMERAL * np.percentile(top[top > 0.0], PLAIN)), 0.0, top)
         there = top > 0.0
         if there.sum() < LEAST_ROWS:
             return np.nan, np.nan

@@ -71,7 +71,7 @@ def test_a_pointers_axis_is_the_one_that_numpy_finds(seed: int) -> None:
     ink[12:16, 70:90] += random.uniform(0.0, 200.0)  # a numeral
     ink = ink.astype(np.float32)
     reach, e_sigma, px = 0.12, 3e-4, 2200.0
-    angle, variance = pointer_axis(ink, r, offset, reach, e_sigma, px)
+    angle, variance = pointer_axis(ink, np.zeros(ink.shape, bool), r, offset, reach, e_sigma, px)
     assert angle == pytest.approx(reference_axis(ink, r, offset, reach, e_sigma, px), abs=1e-5)
     assert 0.0 < variance < 0.1**2
 
@@ -79,5 +79,16 @@ def test_a_pointers_axis_is_the_one_that_numpy_finds(seed: int) -> None:
 def test_an_axis_wants_ink_in_three_rows() -> None:
     ink = np.zeros((20, 60), np.float32)
     r, offset = np.linspace(0.01, 0.03, 20), np.linspace(-0.3, 0.3, 60)
-    angle, variance = pointer_axis(ink, r, offset, 0.1, 3e-4, 2200.0)
+    angle, variance = pointer_axis(ink, np.zeros(ink.shape, bool), r, offset, 0.1, 3e-4, 2200.0)
     assert np.isnan(angle) and np.isnan(variance)
+
+
+def test_rows_where_a_pointer_goes_under_a_cable_do_not_tell_its_axis() -> None:
+    """A cable that crosses the pointer at an angle leaves less and less of it, so the rest leans away from it."""
+    r, offset = np.linspace(0.01, 0.03, 40), np.linspace(-0.3, 0.3, 160)
+    ink = (60.0 * np.exp(-0.5 * (offset * r[:, None] / 6e-4) ** 2)).astype(np.float32)
+    hidden = offset * r[:, None] > 2e-3 * (1.0 - np.arange(40)[:, None] / 26)  # meets the pointer halfway
+    shown = np.where(hidden, 0.0, ink).astype(np.float32)
+    seen, _ = pointer_axis(shown, np.zeros(ink.shape, bool), r, offset, 0.12, 3e-4, 2200.0)
+    known, _ = pointer_axis(shown, hidden, r, offset, 0.12, 3e-4, 2200.0)
+    assert abs(known) < 0.003 < abs(seen)

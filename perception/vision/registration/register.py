@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array, Image
+from hal.jit import compiled
 from hal.panel import Panel
 from perception.vision.noise import noise_sigma
 from perception.vision.projection import PanelProjection
@@ -191,17 +192,35 @@ def _step(
         found = _look(image, reference.moved(delta), edges, window_px)
         if found.ok.sum() < len(delta):
             return delta
-        J = np.einsum("nkp,nk->np", motion[found.ok], found.normals_px[found.ok])
-        r = found.offset_px[found.ok]
-        weighted = J.T * _weights(r, MEASUREMENT_SIGMA_PX)
-        delta = delta + np.linalg.solve(weighted @ J + information, weighted @ r - information @ delta)
+        N, g = _normal_equations(motion, found.normals_px, found.offset_px, found.ok)
+        delta = delta + np.linalg.solve(N + information, g - information @ delta)
     return delta
 
 
+@compiled
+def _normal_equations(motion: Array, normals_px: Array, offset_px: Array, ok: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return J^T W J and J^T W r of the edges found, with Cauchy weights W.
+
+    J is the motion (N, 2, P) along the normals (N, 2), and r is the offset (N,) found there.
+    """
+    weights = _weights(offset_px[ok], MEASUREMENT_SIGMA_PX)
+    count = motion.shape[2]
+    N, g = np.zeros((count, count)), np.zeros(count)
+    for weight, k in zip(weights, np.flatnonzero(ok)):  # noqa: B905 - numba knows no strict zip
+        along = motion[k, 0] * normals_px[k, 0] + motion[k, 1] * normals_px[k, 1]
+        for i in range(count):
+            g[i] += weight * along[i] * offset_px[k]
+            for j in range(count):
+                N[i, j] += weight * along[i] * along[j]
+    return N, g
+
+
+@compiled
 def _weights(residuals: Array, least_sigma: float) -> Array:
     """Return the Cauchy weights of residuals whose scale is their median magnitude, but at least `least_sigma`."""
     scale = max(1.4826 * float(np.median(np.abs(residuals))), least_sigma)
-    return np.asarray(1.0 / (1.0 + (residuals / (1.5 * scale)) ** 2) / scale**2)
+    weights: Array = 1.0 / (1.0 + (residuals / (1.5 * scale)) ** 2) / scale**2
+    return weights
 
 
 def fit_object(image: EdgeImage, view: PanelProjection, edges: Outline, built_m: float) -> ObjectFit:

@@ -6,10 +6,9 @@ import numpy as np
 
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
-from hal.geometry import UncertainPose, difference, perturbed, transform_rpy
-from perception.calibration.hand_eye import calibrate_hand_eye, stations
-from perception.calibration.hand_eye_equation import HandEyeView
-from perception.vision.quadrangle import estimate
+from hal.geometry import difference, perturbed, transform_rpy
+from perception.calibration import Beforehand, InHandState, InHandView, calibrate_in_hand
+from perception.calibration.calibration_poses import stations
 
 LIGHTS = np.array([[-0.28, 0.2, 0.0], [0.28, 0.2, 0.0], [0.28, -0.2, 0.0], [-0.28, -0.2, 0.0]])
 LENS = CameraIntrinsics(
@@ -18,6 +17,11 @@ LENS = CameraIntrinsics(
 )  # fmt: skip
 PIXEL_SIGMA = 0.15
 ARM_SIGMA = 1e-4  # m and rad
+# Lens and lights are known exactly.
+KNOWN = Beforehand(
+    focal_ratio=1e-7, centre_px=1e-4, k1=1e-7, point_m=1e-8, arm_m=ARM_SIGMA, arm_rad=ARM_SIGMA, offset=(1e-6, 1e-6)
+)
+ROUGH = np.repeat([0.01, 0.05], 3)  # errors of the drawing of mount and panel, m and rad
 
 
 def trial(seed: int) -> tuple[float, float]:
@@ -30,10 +34,13 @@ def trial(seed: int) -> tuple[float, float]:
         real = perturbed(flange, rng.normal(scale=ARM_SIGMA, size=6))
         camera_from_panel = (real * x).inv() * z
         pixels = project(camera_from_panel.apply(LIGHTS), LENS) + rng.normal(scale=PIXEL_SIGMA, size=(4, 2))
-        pose = estimate(LIGHTS, pixels, PIXEL_SIGMA**2, LENS)
-        seen = UncertainPose(parent_from_child=pose.camera_from_object, covariance=pose.covariance)
-        views.append(HandEyeView(base_from_flange=flange, camera_from_target=seen))
-    found = calibrate_hand_eye(views, arm_sigma_m=ARM_SIGMA, arm_sigma_rad=ARM_SIGMA)
+        covariance = np.tile(PIXEL_SIGMA**2 * np.eye(2), (4, 1, 1))
+        views.append(InHandView(base_from_flange=flange, pixels_px=pixels, covariance_px=covariance))
+    start = InHandState(
+        flange_from_camera=perturbed(x, rng.normal(scale=ROUGH)), base_from_target=perturbed(z, rng.normal(scale=ROUGH)),
+        intrinsics=LENS, point_errors_m=np.zeros((4, 3)),
+    )  # fmt: skip
+    found = calibrate_in_hand(views, LIGHTS, start, KNOWN)
     e = difference(x, found.flange_from_camera.parent_from_child)
     return float(1e3 * np.linalg.norm(e[:3])), float(np.degrees(np.linalg.norm(e[3:])))
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
-from hal.geometry import certain, matrix_of, transform
-from perception.calibration.hand_eye import propose_next, stations
-from perception.calibration.hand_eye_equation import HandEyeView
+from hal.geometry import matrix_of, skew, transform
 
 EDGE_PX = 24.0  # a light nearer to the image's edge may be cut off
 LIGHTS_CONE_RAD = 0.95  # half angle; with 0.6 rad the camera's position along its axis would be 1.5 times as uncertain
@@ -20,10 +19,34 @@ PLATE_CONE_RAD = 0.6
 REACH_STEPS = (0.8, 1.0, 1.2, 1.45, 1.7)  # distances, relative to the shortest one from which everything is in view
 # Standard deviations of a pose from a scan; a plane does not determine shifts in it and rotations about its normal.
 PLATE_SIGMA = (1.0, 1.0, 2e-4, 5e-4, 5e-4, 1.0)
+ARM_SIGMA = 1e-4  # repeatability of the arm, m and rad
+ROUGHLY = np.tile(np.repeat([0.1, 0.3], 3), 2)  # prior standard deviations of mount and plate, m and rad
 WRIST_RAD = (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)  # tried angles of the wrist's joints, relative to the parking place
 
 Propose = Callable[[Sequence[RigidTransform], Sequence[RigidTransform]], int]
 """A function of the flange poses so far and the candidates that returns the index of the best candidate."""
+
+
+def stations(
+    base_from_target: RigidTransform, flange_from_camera: RigidTransform, *, distance_m: float, count: int = 40,
+    cone_rad: float = 0.7,
+) -> list[RigidTransform]:  # fmt: skip
+    """Return flange poses from which the camera looks at the target's middle, in a cone about its normal (z).
+
+    They lie on a spiral (golden angle), so that any number of them covers the cone evenly, and have different rolls.
+    """
+    found = []
+    for k in range(count):
+        tilt = cone_rad * np.sqrt((k + 0.5) / count)
+        azimuth = k * np.pi * (3.0 - np.sqrt(5.0))
+        away = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
+        z = -away
+        x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+        x /= np.linalg.norm(x)
+        looking = transform(np.column_stack([x, np.cross(z, x), z]), distance_m * away)
+        roll = transform(Rotation.from_rotvec([0.0, 0.0, cone_rad * np.sin(2.4 * k)]).as_matrix(), np.zeros(3))
+        found.append(base_from_target * looking * roll * flange_from_camera.inv())
+    return found
 
 
 def around(
@@ -65,19 +88,35 @@ def plate_view(target: RigidTransform) -> Array:
 
 
 def by_plate(flange_from_sensor: RigidTransform, base_from_plate: RigidTransform) -> Propose:
-    """Return a function that proposes the most informative pose for a sensor that sees a plate."""
+    """Return a function that proposes the pose after which the mount of a sensor that sees a plate is known best."""
 
     def propose(done: Sequence[RigidTransform], candidates: Sequence[RigidTransform]) -> int:
-        views = [
-            HandEyeView(
-                base_from_flange=flange,
-                camera_from_target=certain((flange * flange_from_sensor).inv() * base_from_plate),
-            )
-            for flange in done
+        known = np.diag(ROUGHLY**-2.0)
+        for flange in done:
+            known += _information(flange, flange_from_sensor, base_from_plate)
+        covariances = [
+            np.linalg.inv(known + _information(flange, flange_from_sensor, base_from_plate)) for flange in candidates
         ]
-        return propose_next(views, (flange_from_sensor, base_from_plate), candidates, view_covariance=plate_view)[0]
+        return int(np.argmin([np.linalg.slogdet(covariance[:6, :6])[1] for covariance in covariances]))
 
     return propose
+
+
+def _information(flange: RigidTransform, x: RigidTransform, z: RigidTransform) -> Array:
+    """Return the information (12, 12) about mount X and plate Z of a scan B = X^-1 A^-1 Z from the flange pose A.
+
+    The residual is that of the hand-eye equation A X B = Z, with noise of the arm and of the scan (`plate_view`).
+    """
+    plate = (flange * x).inv() * z
+    Ra, Rx = matrix_of(flange), matrix_of(x)
+    lever = Rx @ plate.translation
+    none = np.zeros((3, 3))
+    by_a = np.block([[np.eye(3), -skew(Ra @ (x.translation + lever))], [none, np.eye(3)]])
+    by_x = np.block([[Ra, -Ra @ skew(lever)], [none, Ra]])
+    by_b = block_diag(Ra @ Rx, Ra @ Rx)
+    noise = ARM_SIGMA**2 * by_a @ by_a.T + by_b @ plate_view(plate) @ by_b.T
+    J = np.hstack([by_x, -np.eye(6)])
+    return np.asarray(J.T @ np.linalg.solve(noise, J))
 
 
 def wrist_turns(

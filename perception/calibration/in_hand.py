@@ -11,18 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
-from hal.errors import InvalidRequest
-from hal.geometry import UncertainPose, certain
+from hal.errors import InvalidRequest, NotObservable
+from hal.geometry import UncertainPose, matrix_of
 from hal.least_squares import Minimum, descend
-from perception.calibration.hand_eye import check_accuracy, check_turns
-from perception.calibration.hand_eye_equation import HandEyeView
+from perception.calibration.calibration_poses import ROUGHLY
 from perception.calibration.in_hand_model import (
     FREE,
     INDEX,
@@ -41,8 +41,8 @@ LIMIT_M = 0.001  # largest accepted standard deviation of the mount; one known l
 LIMIT_RAD = 0.0035
 OUTLIER_P = 1e-4  # a view is an outlier if noise gives its residuals with a smaller probability
 FEWEST_VIEWS = 4
-# Prior standard deviations of mount and target in m and rad, so that the first views can be compared.
-ROUGHLY = np.repeat([0.1, 0.3, 0.1, 0.3], 3)
+LEAST_AXIS_SPREAD = 0.02  # mean sin^2 between rotation axes: 8 degrees; with less, one coordinate of X is mostly noise
+LEAST_TURN_RAD = 0.05  # smaller rotations between two stations are not used to judge the spread
 LEVER_M = 0.1  # distance at which a rotation error of the mount is converted to a shift
 
 
@@ -96,8 +96,7 @@ def calibrate_in_hand(
     used = list(range(len(views)))
     while True:
         kept = [views[k] for k in used]
-        check_turns([HandEyeView(base_from_flange=v.base_from_flange, camera_from_target=certain(v.base_from_flange))
-                     for v in kept])  # fmt: skip
+        check_turns([view.base_from_flange for view in kept])
         state, minimum = _fit(kept, points_m, start, known)
         errors = [chi_square(view, points_m, state, known) for view in kept]
         worst = int(np.argmax(errors))
@@ -107,7 +106,7 @@ def calibrate_in_hand(
     rest = np.concatenate([residual(views[k], points_m, state, known.disc_m)[0] for k in used])
     # Residuals larger than the stated noise explains make all parameters less certain, in proportion.
     covariance = minimum.covariance * max(1.0, minimum.chi_square / (len(rest) - 12))
-    check_accuracy(covariance, len(used), limit_m=limit_m, limit_rad=limit_rad)
+    _check_accuracy(covariance, len(used), limit_m, limit_rad)
     return InHandCalibration(
         flange_from_camera=UncertainPose(
             parent_from_child=state.flange_from_camera, covariance=covariance[:6, :6]
@@ -206,3 +205,64 @@ def _fit(
 
         state, minimum = descend(state, linearise, moved)
     return state, minimum
+
+
+def check_turns(flanges: Sequence[RigidTransform]) -> None:
+    """Check that the rotations between the stations have different axes.
+
+    Raises:
+        NotObservable: they share one axis, so that the shift of X along it is not determined; `details["next_axis"]` is
+            the axis (flange frame) about which to rotate next.
+    """
+    spread, axis = _axis_spread(flanges)
+    if spread < LEAST_AXIS_SPREAD:
+        words = _across(axis)
+        raise NotObservable(
+            "the hand turned about one axis only, so the camera's place along that axis stays free",
+            hint=f"turn the flange by 20 degrees or more about {words} (flange axes) and look at the target again",
+            next_axis=words, axis_spread=round(spread, 4),
+        )  # fmt: skip
+
+
+def _axis_spread(flanges: Sequence[RigidTransform]) -> tuple[float, Array]:
+    """Return the spread of the rotation axes between flange poses, and their main axis in the flange frame.
+
+    The spread is the mean sin^2 of their angle from the main axis in the second direction, 0 to 0.5.
+    """
+    R = np.array([matrix_of(flange) for flange in flanges])
+    i, j = np.array(list(combinations(range(len(R)), 2))).T
+    turns = Rotation.from_matrix(R[i].swapaxes(1, 2) @ R[j]).as_rotvec()
+    angles = np.linalg.norm(turns, axis=1)
+    large = angles > LEAST_TURN_RAD
+    if not large.any():
+        return 0.0, np.array([0.0, 0.0, 1.0])
+    # The axis of a small rotation is less certain, so it counts less.
+    axes = turns[large] / angles[large, None] * np.minimum(angles[large, None] / 0.3, 1.0)
+    values, vectors = np.linalg.eigh(axes.T @ axes / len(axes))
+    return float(values[1]), vectors[:, 2]
+
+
+def _across(axis: Array) -> list[float]:
+    """Return a direction across an axis, rounded for people."""
+    across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    return [float(v) for v in np.round(across / np.linalg.norm(across), 2)]
+
+
+def _check_accuracy(covariance: Array, count: int, limit_m: float, limit_rad: float) -> None:
+    """Check that the covariance of the mount, the first six rows of `covariance`, is within the limits.
+
+    Raises:
+        NotObservable: the standard deviation in the worst direction is above a limit; `details["next_axis"]` is the
+            axis about which to rotate next. `count` is the number of views, for the message.
+    """
+    values, vectors = np.linalg.eigh(covariance[:3, :3])
+    turn = np.linalg.eigvalsh(covariance[3:6, 3:6])
+    if np.sqrt(values[2]) <= limit_m and np.sqrt(turn[2]) <= limit_rad:
+        return
+    words = _across(vectors[:, 2])
+    raise NotObservable(
+        f"{count} views leave the camera uncertain by {1e3 * np.sqrt(values[2]):.1f} mm along "
+        f"{np.round(vectors[:, 2], 2).tolist()} (flange axes) and by {np.degrees(np.sqrt(turn[2])):.2f} deg",
+        hint=f"add views turned by 20 degrees or more about {words} (flange axes), or nearer to the target",
+        next_axis=words, sigma_mm=round(1e3 * float(np.sqrt(values[2])), 2),
+    )  # fmt: skip

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from hal.calibration import CalibrationRecord, IntrinsicsRecord, LoadRecord, MountRecord, Vector3
 from hal.geometry import UncertainPose
 from hal.toml_text import toml_edited, toml_text
 from perception.calibration.depth_bend import DepthBend
-from perception.calibration.hand_eye import HandEye
 from perception.calibration.in_hand import InHandCalibration
 from perception.calibration.in_hand_model import FREE
 from perception.calibration.intrinsics import CameraCalibration
@@ -29,7 +30,7 @@ def mount_of(parent_from_device: UncertainPose) -> MountRecord:
 
 def record_of(
     device: str,
-    result: HandEye | InHandCalibration | CameraCalibration | ScannerCalibration | WrenchCalibration | DepthBend,
+    result: InHandCalibration | CameraCalibration | ScannerCalibration | WrenchCalibration | DepthBend,
     *,
     date: str,
 ) -> CalibrationRecord:
@@ -39,31 +40,44 @@ def record_of(
         device: its name in the cell file.
         date: ISO 8601, from the caller's clock.
     """
-    if isinstance(result, HandEye):
-        quality = {"chi_square_ratio": result.chi_square / max(result.degrees, 1), "views": float(len(result.used))}
-        return CalibrationRecord(
-            device=device, date=date, method="hand-eye", mount=mount_of(result.flange_from_camera), quality=quality
-        )
-    if isinstance(result, InHandCalibration):
-        return _in_hand_record(device, result, date)
-    if isinstance(result, ScannerCalibration):
-        quality = {"chi_square_ratio": result.chi_square / max(result.degrees, 1), "rms_m": result.rms_m}
-        return CalibrationRecord(
-            device=device, date=date, method="plate-scans", mount=mount_of(result.flange_from_scanner), quality=quality
-        )
+    record = partial(CalibrationRecord, device=device, date=date)
     if isinstance(result, DepthBend):
         quality = {"bend_before_per_m": result.before, "bend_after_per_m": result.after, "walls": float(result.walls)}
-        return CalibrationRecord(device=device, date=date, method="walls", depth_bend=result.record, quality=quality)
+        return record(method="walls", depth_bend=result.record, quality=quality)
     if isinstance(result, WrenchCalibration):
-        load = result.load
-        sigma = np.sqrt(np.diag(result.covariance))
-        return CalibrationRecord(
-            device=device, date=date, method="tool-weight",
-            load=LoadRecord(mass_kg=load.mass_kg, centre_of_mass_m=load.centre_of_mass_m,
-                            bias_force_n=_three(load.bias[:3]), bias_torque_nm=_three(load.bias[3:])),
-            quality={"rms_n": result.rms_n, "rms_nm": result.rms_nm, "mass_sigma_kg": float(sigma[3])},
+        load = LoadRecord(
+            mass_kg=result.load.mass_kg, centre_of_mass_m=result.load.centre_of_mass_m,
+            bias_force_n=_three(result.load.bias[:3]), bias_torque_nm=_three(result.load.bias[3:]),
         )  # fmt: skip
-    return _camera_record(device, result, date)
+        sigma_kg = float(np.sqrt(result.covariance[3, 3]))
+        quality = {"rms_n": result.rms_n, "rms_nm": result.rms_nm, "mass_sigma_kg": sigma_kg}
+        return record(method="tool-weight", load=load, quality=quality)
+    quality = {"chi_square_ratio": result.chi_square / max(result.degrees, 1)}
+    if isinstance(result, ScannerCalibration):
+        mount = mount_of(result.flange_from_scanner)
+        return record(method="plate-scans", mount=mount, quality=quality | {"rms_m": result.rms_m})
+    if isinstance(result, CameraCalibration):
+        sigmas = zip(result.names, np.sqrt(np.diag(result.covariance)).tolist(), strict=True)
+        quality = {f"sigma_{name}": sigma for name, sigma in sigmas} | quality | {"cubic_bias_px": result.cubic.bias_px}
+        return record(method="intrinsics", intrinsics=_lens_of(result), quality=quality)
+    mount, i = mount_of(result.flange_from_camera), result.intrinsics
+    sigma = dict(zip(FREE, result.lens_sigma.tolist(), strict=True))
+    lens = _lens_of(
+        result, sigma_k1=sigma["k1"], sigma_focal_ratio=max(sigma["fx"] / i.fx_px, sigma["fy"] / i.fy_px),
+        sigma_centre_px=max(sigma["cx"], sigma["cy"]),
+    )  # fmt: skip
+    quality |= {"views": float(len(result.used)), "rms_px": result.rms_px}
+    quality |= {"sigma_m": max(mount.sigma_m), "sigma_rad": max(mount.sigma_rad)}
+    return record(method="hand-eye and lens by the panel's lights", mount=mount, intrinsics=lens, quality=quality)
+
+
+def _lens_of(result: InHandCalibration | CameraCalibration, **sigmas: float) -> IntrinsicsRecord:
+    """Return the record of a lens, with the standard deviations that are known."""
+    i = result.intrinsics
+    return IntrinsicsRecord(
+        width_px=i.width_px, height_px=i.height_px, fx_px=i.fx_px, fy_px=i.fy_px, cx_px=i.cx_px, cy_px=i.cy_px,
+        distortion=i.distortion, rms_px=result.rms_px, **sigmas,
+    )  # fmt: skip
 
 
 def renewed(current: CalibrationRecord, found: CalibrationRecord) -> CalibrationRecord:
@@ -85,41 +99,6 @@ def to_toml(record: CalibrationRecord, *, over: str | None = None) -> str:
     if not record.to_measure:
         del data["to_measure"]
     return toml_text(data) if over is None else toml_edited(over, data)
-
-
-def _in_hand_record(device: str, result: InHandCalibration, date: str) -> CalibrationRecord:
-    """Return the record of a joint calibration of mount and lens."""
-    i = result.intrinsics
-    sigma = dict(zip(FREE, result.lens_sigma.tolist(), strict=True))
-    mount = mount_of(result.flange_from_camera)
-    return CalibrationRecord(
-        device=device, date=date, method="hand-eye and lens by the panel's lights",
-        mount=mount,
-        intrinsics=IntrinsicsRecord(
-            width_px=i.width_px, height_px=i.height_px, fx_px=i.fx_px, fy_px=i.fy_px, cx_px=i.cx_px, cy_px=i.cy_px,
-            distortion=i.distortion, rms_px=result.rms_px, sigma_k1=sigma["k1"],
-            sigma_focal_ratio=max(sigma["fx"] / i.fx_px, sigma["fy"] / i.fy_px),
-            sigma_centre_px=max(sigma["cx"], sigma["cy"]),
-        ),
-        quality={"chi_square_ratio": result.chi_square / max(result.degrees, 1), "views": float(len(result.used)),
-                 "rms_px": result.rms_px, "sigma_m": max(mount.sigma_m), "sigma_rad": max(mount.sigma_rad)},
-    )  # fmt: skip
-
-
-def _camera_record(device: str, result: CameraCalibration, date: str) -> CalibrationRecord:
-    """Return the record of a calibration of the intrinsics."""
-    i = result.intrinsics
-    sigma = dict(zip(result.names, np.sqrt(np.diag(result.covariance)).tolist(), strict=True))
-    quality = {f"sigma_{name}": value for name, value in sigma.items()}
-    return CalibrationRecord(
-        device=device, date=date, method="intrinsics",
-        intrinsics=IntrinsicsRecord(
-            width_px=i.width_px, height_px=i.height_px, fx_px=i.fx_px, fy_px=i.fy_px, cx_px=i.cx_px, cy_px=i.cy_px,
-            distortion=i.distortion, rms_px=result.rms_px,
-        ),
-        quality=quality | {"chi_square_ratio": result.chi_square / max(result.degrees, 1),
-                           "cubic_bias_px": result.cubic.bias_px},
-    )  # fmt: skip
 
 
 def _three(values: object) -> Vector3:

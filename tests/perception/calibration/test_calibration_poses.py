@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from hal.camera_model import project
 from hal.config import load_cell
 from hal.errors import NotObservable
-from hal.geometry import certain, matrix_of, transform_rpy
+from hal.geometry import UncertainPose, matrix_of, transform_rpy
 from manipulation.arm.kinematics import Kinematics
 from perception.calibration.calibration_poses import (
     EDGE_PX,
@@ -18,11 +18,13 @@ from perception.calibration.calibration_poses import (
     by_plate,
     in_view,
     plate_view,
+    stations,
     wrist_turns,
 )
-from perception.calibration.hand_eye import check_turns
-from perception.calibration.hand_eye_equation import HandEyeView
+from perception.calibration.in_hand import check_turns
+from perception.calibration.scanner import calibrate_scanner
 from perception.calibration.wrench import GRAVITY_M_PER_S2, calibrate_wrench
+from tests.perception.calibration.test_scanner import PLATE, PLATE_COVARIANCE, Y_TRUE, scan
 
 ROOT = Path(__file__).parents[3]
 CELL = load_cell(ROOT / "cells/bench.toml")
@@ -68,7 +70,27 @@ def test_the_first_stations_chosen_for_a_scanner_turn_about_several_axes() -> No
     done: list[RigidTransform] = []
     for _ in range(4):
         done.append(candidates.pop(propose(done, candidates)))
-    check_turns([HandEyeView(base_from_flange=f, camera_from_target=certain(f)) for f in done])  # raises if not
+    check_turns(done)  # raises if not
+
+
+def test_the_proposed_pose_helps_a_scanner_more_than_the_average_one() -> None:
+    candidates = around(PLATE, Y_TRUE, 0.45, steps=(1.0,), cone_rad=0.6)
+    done = stations(PLATE, Y_TRUE, distance_m=0.4, count=6, cone_rad=0.6)
+    rng = np.random.default_rng(5)
+    plate = UncertainPose(parent_from_child=PLATE, covariance=PLATE_COVARIANCE)
+
+    def log_determinant(more: RigidTransform) -> float:
+        found = calibrate_scanner([scan(f, rng, is_line=False) for f in [*done, more]], Y_TRUE, plate)
+        return float(np.linalg.slogdet(found.flange_from_scanner.covariance)[1])
+
+    best = by_plate(Y_TRUE, PLATE)(done, candidates)
+    assert log_determinant(candidates[best]) < np.mean([log_determinant(pose) for pose in candidates[::3]])
+
+
+def test_stations_look_straight_at_the_target() -> None:
+    for flange in stations(PLATE, Y_TRUE, distance_m=0.5, count=15):
+        target = ((flange * Y_TRUE).inv() * PLATE).translation
+        np.testing.assert_allclose(target, [0.0, 0.0, 0.5], atol=1e-9)
 
 
 def test_wrist_turns_tell_weight_from_bias_within_the_limits() -> None:

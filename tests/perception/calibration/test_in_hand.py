@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hal.calibration import CameraIntrinsics
 from hal.camera_model import project
 from hal.errors import InvalidRequest, NotObservable
-from hal.geometry import difference, perturbed, transform_rpy
-from perception.calibration.hand_eye import stations
+from hal.geometry import difference, perturbed, transform, transform_rpy
+from perception.calibration.calibration_poses import stations
 from perception.calibration.in_hand import InHandCalibration, calibrate_in_hand, propose_view
 from perception.calibration.in_hand_model import (
     FREE,
@@ -127,12 +127,19 @@ def test_a_view_of_something_else_is_left_out_by_its_number() -> None:
     assert np.linalg.norm(difference(X_TRUE, result.flange_from_camera.parent_from_child)[:3]) < 1e-3
 
 
-def test_turns_about_one_axis_are_refused_and_another_is_named() -> None:
-    flanges = [perturbed(poses(1)[0], [0, 0, 0, *(a * np.array([0.0, 0.0, 1.0]))]) for a in np.linspace(-0.3, 0.3, 8)]
-    with pytest.raises(NotObservable) as refused:
+@pytest.mark.parametrize("kind", ["shifts only", "one axis"])
+def test_turns_about_one_axis_are_refused_and_another_is_named(kind: str) -> None:
+    first, turns = poses(1)[0], np.linspace(-0.3, 0.3, 8) * (kind == "one axis")
+    flanges = [perturbed(first, [0.02 * np.sin(k), 0.01 * k, 0, 0, 0, a]) for k, a in enumerate(turns)]
+    with pytest.raises(NotObservable, match="one axis") as refused:
         calibrate_in_hand(drawn(2, flanges), POINTS, start(), KNOWN)
-    turned_about = poses(1)[0].rotation.inv().apply([0.0, 0.0, 1.0])
-    assert abs(np.dot(refused.value.details["next_axis"], turned_about)) < 0.1
+    axis = np.array(refused.value.details["next_axis"])
+    if kind == "one axis":
+        assert abs(axis @ first.rotation.inv().apply([0.0, 0.0, 1.0])) < 0.1
+        turned = [
+            first * transform(Rotation.from_rotvec(angle * axis).as_matrix(), np.zeros(3)) for angle in (-0.5, 0.5)
+        ]
+        calibrate_in_hand(drawn(2, flanges + turned), POINTS, start(), KNOWN, limit_m=0.005, limit_rad=0.02)
 
 
 def test_too_little_turning_is_refused_with_the_direction_that_stays_open() -> None:

@@ -13,17 +13,24 @@ from pydantic import ValidationError
 from hal.calibration import CalibrationRecord, MountRecord, load_calibration
 from hal.geometry import UncertainPose, difference, transform_rpy
 from hal.strict import parse_toml
-from perception.calibration.hand_eye import calibrate_hand_eye
 from perception.calibration.in_hand import calibrate_in_hand
 from perception.calibration.intrinsics import calibrate_camera
 from perception.calibration.records import mount_of, record_of, renewed, to_toml
 from perception.calibration.scanner import ScannerCalibration
 from perception.calibration.wrench import calibrate_wrench
-from tests.perception.calibration.test_hand_eye import good_flanges, station_views
 from tests.perception.calibration.test_in_hand import KNOWN, POINTS, drawn, start
 from tests.perception.calibration.test_in_hand import poses as twelve
 from tests.perception.calibration.test_intrinsics import DOTS, views
 from tests.perception.calibration.test_wrench import poses, reading
+
+# fmt: off
+SCANNER = ScannerCalibration(
+    flange_from_scanner=UncertainPose(
+        parent_from_child=transform_rpy([0.1, 0, 0], [0, 0, 1]), covariance=1e-8 * np.eye(6)
+    ),
+    chi_square=90.0, degrees=100, rms_m=0.001,
+)
+# fmt: on
 
 
 def test_a_mount_comes_back_with_its_covariance() -> None:
@@ -54,13 +61,10 @@ def test_correlations_that_cannot_be_are_refused(correlations: tuple[float, ...]
 
 def test_every_kind_of_result_is_written_and_read_back(tmp_path: Path) -> None:
     R = poses(8, 1)
-    mount = UncertainPose(parent_from_child=transform_rpy([0.1, 0, 0], [0, 0, 1]), covariance=1e-8 * np.eye(6))
-    scanner = ScannerCalibration(flange_from_scanner=mount, plane_base=(np.array([0.0, 0, 1]), 0.5), chi_square=90.0,
-                                 degrees=100, rms_m=0.001)  # fmt: skip
     results = {
-        "wrist_camera": calibrate_hand_eye(station_views(good_flanges(), 1)),
         "camera": calibrate_camera(views(DOTS, 6, seed=1), (640, 480)),
-        "range_scanner": scanner,
+        "range_scanner": SCANNER,
+        "wrist_camera": calibrate_in_hand(drawn(1, twelve()), POINTS, start(), KNOWN),
         "wrist_ft": calibrate_wrench(R, [reading(r) for r in R]),
     }
     for name, result in results.items():
@@ -74,9 +78,9 @@ def test_every_kind_of_result_is_written_and_read_back(tmp_path: Path) -> None:
 
 def test_a_renewed_record_keeps_what_was_not_measured_and_counts_up() -> None:
     camera = record_of("camera", calibrate_camera(views(DOTS, 6, seed=1), (640, 480)), date="2026-11-20")
-    mount = record_of("camera", calibrate_hand_eye(station_views(good_flanges(), 1)), date="2026-11-21")
+    mount = record_of("camera", SCANNER, date="2026-11-21")
     record = renewed(camera, mount)
-    assert (record.version, record.date, record.method) == (2, "2026-11-21", "hand-eye")
+    assert (record.version, record.date, record.method) == (2, "2026-11-21", "plate-scans")
     assert record.intrinsics == camera.intrinsics and record.mount == mount.mount
     assert record.quality == mount.quality
     assert renewed(record, camera).version == 3

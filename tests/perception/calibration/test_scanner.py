@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.errors import InvalidRequest, NotObservable
 from hal.geometry import UncertainPose, difference, matrix_of, perturbed, transform, transform_rpy
-from perception.calibration.hand_eye import stations
+from perception.calibration.calibration_poses import stations
 from perception.calibration.scanner import ScannerView, calibrate_scanner
 
 Y_TRUE = transform_rpy([0.05, 0.02, 0.04], [0.05, -0.1, 0.2])

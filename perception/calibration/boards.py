@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,8 +52,6 @@ class Charuco:
 
     def _board(self) -> Any:
         """Build OpenCV's description of the board."""
-        import cv2
-
         words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, words)
 
@@ -67,8 +66,6 @@ class Charuco:
         Raises:
             NotFound: fewer than six corners.
         """
-        import cv2
-
         board = self._board()
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
         if ids is None or len(ids) < FEWEST_POINTS:
@@ -103,8 +100,6 @@ class Dots:
         Raises:
             NotFound: not the whole grid is visible.
         """
-        import cv2
-
         found, centres = cv2.findCirclesGrid(image, (self.columns, self.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
         if not found:
             raise NotFound(
@@ -118,8 +113,6 @@ class Dots:
 
     def _radius_m(self, image: NDArray[np.uint8], centres_px: Array) -> float:
         """Return the radius of the dots, from the ratio of a dot's dark area to the area of one cell of the grid."""
-        import cv2
-
         grid = centres_px.reshape(self.rows, self.columns, 2)
         across, down = np.asarray(np.gradient(grid, axis=1)), np.asarray(np.gradient(grid, axis=0))
         cell_px = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]).ravel()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,31 +44,18 @@ def cubic_monomials(pixels_px: ArrayLike, centre_px: tuple[float, float], scale_
     return np.stack([one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1)
 
 
-def fit_cubic(
-    views: Sequence[BoardView], intrinsics: CameraIntrinsics, poses: Sequence[RigidTransform]
-) -> tuple[CubicLens, Array]:
-    """Fit the paper's correction: linear least squares of the points' ideal pixels over cubics of the measured ones.
-
-    Returns: the correction, and the (10, 10) covariance of the coefficients of one axis (px^2).
-    """
+def fit_cubic(views: Sequence[BoardView], intrinsics: CameraIntrinsics, poses: Sequence[RigidTransform]) -> CubicLens:
+    """Fit the paper's correction: linear least squares of the points' ideal pixels over cubics of the measured ones."""
     width, height = intrinsics.width_px, intrinsics.height_px
     centre, scale = ((width - 1) / 2.0, (height - 1) / 2.0), width / 2.0
-    straight = CameraIntrinsics(
-        width_px=width, height_px=height, fx_px=intrinsics.fx_px, fy_px=intrinsics.fy_px, cx_px=intrinsics.cx_px,
-        cy_px=intrinsics.cy_px,
-    )  # fmt: skip
+    straight = replace(intrinsics, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
     measured = np.concatenate([view.pixels_px for view in views])
     ideal = np.concatenate(
         [project(pose.apply(view.points_m), straight) for view, pose in zip(views, poses, strict=True)]
     )
-    rows = cubic_monomials(measured, centre, scale)
-    coefficients = np.linalg.lstsq(rows, ideal, rcond=None)[0]
-    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=0.0)
-    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID)), axis=-1)
-    grid = grid.reshape(-1, 2)
-    miss = lens.ideal(grid) - undistort_pixels(grid, intrinsics)
-    bias = float(np.sqrt(np.nanmean(np.sum(miss**2, axis=1))))
-    sigma = float(np.mean([view.sigma_px for view in views]))
-    covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
-    lens = CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=bias)
-    return lens, np.asarray(covariance)
+    coefficients = np.linalg.lstsq(cubic_monomials(measured, centre, scale), ideal, rcond=None)[0]
+    u, v = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
+    grid = np.column_stack([u.ravel(), v.ravel()])
+    miss = cubic_monomials(grid, centre, scale) @ coefficients - undistort_pixels(grid, intrinsics)
+    bias_px = float(np.sqrt(np.nanmean(np.sum(miss**2, axis=1))))
+    return CubicLens(coefficients=coefficients, centre_px=centre, scale_px=scale, bias_px=bias_px)

@@ -70,29 +70,27 @@ def calibrate_depth(
     """
     shape = _shape(walls_m)
     walls = [_samples(k, np.asarray(depth, float), focal_px, centre_px) for k, depth in enumerate(walls_m)]
-    v, u = np.mgrid[: shape[0] : STRIDE, : shape[1] : STRIDE]
-    whole = _node_weights(u.ravel(), v.ravel(), shape)
-    rays = np.column_stack(
-        [(u.ravel() - centre_px[0]) / focal_px[0], (v.ravel() - centre_px[1]) / focal_px[1], np.ones(u.size)]
-    )
+    whole = _samples(0, np.ones(shape), focal_px, centre_px)
+    linear = whole.rays.T @ whole.nodes / len(whole.rays)
     field = np.zeros(ROWS * COLUMNS)
     weights = [np.ones(len(wall.inverse)) for wall in walls]
     for _ in range(ROUNDS):
-        field = _solved(walls, weights, rays.T @ whole / len(whole))
-        straight = [wall.inverse + wall.nodes @ field for wall in walls]
-        offs = [_off_plane(*one) for one in zip(walls, straight, weights, strict=True)]
-        weights = [_weights(off) for off in offs]
-    before = [_bent(wall, wall.inverse, weight) for wall, weight in zip(walls, weights, strict=True)]
-    after = [
-        _bent(wall, wall.inverse + wall.nodes @ field, weight) for wall, weight in zip(walls, weights, strict=True)
-    ]
-    noise = float(np.sqrt(np.mean([_noise(wall, weight) ** 2 for wall, weight in zip(walls, weights, strict=True)])))
+        field = _solved(walls, weights, linear)
+        weights = [
+            _weights(_off_plane(wall, wall.inverse + wall.nodes @ field, weight))
+            for wall, weight in zip(walls, weights, strict=True)
+        ]
+    before, after = (
+        _rms([_bent(wall, wall.inverse + wall.nodes @ added, w) for wall, w in zip(walls, weights, strict=True)])
+        for added in (0.0 * field, field)
+    )
+    noise = _rms([_noise(wall, weight) for wall, weight in zip(walls, weights, strict=True)])
     result = DepthBend(
         record=DepthBendRecord(
             width_px=shape[1], height_px=shape[0],
             per_m=tuple(tuple(round(value, 8) for value in row) for row in field.reshape(ROWS, COLUMNS).tolist()),
         ),
-        before=_rms(before), after=_rms(after), walls=len(walls),
+        before=before, after=after, walls=len(walls),
     )  # fmt: skip
     if result.after > max(MOST_LEFT * result.before, noise):
         raise NotObservable(
@@ -196,5 +194,5 @@ def _noise(wall: _Wall, weight: Array) -> float:
     return sigma * float(np.sqrt(np.mean((share**2).sum(axis=0) / np.maximum(share.sum(axis=0), 1e-9) ** 2)))
 
 
-def _rms(parts: Sequence[Array]) -> float:
+def _rms(parts: Sequence[Array] | Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(parts))))

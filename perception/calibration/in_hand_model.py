@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
 from hal.arrays import Array
@@ -131,22 +132,12 @@ def residual(view: InHandView, points_m: Array, state: InHandState, disc_m: floa
 
 def noise(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> Array:
     """Return the covariance (2N, 2N) of a view's residuals: noise of the pixels, and the common effect of the arm."""
-    Rx, Rz = matrix_of(state.flange_from_camera), matrix_of(state.base_from_target)
-    Ra = matrix_of(view.base_from_flange)
-    world = (points_m + state.point_errors_m) @ Rz.T + state.base_from_target.translation
-    from_flange = world - view.base_from_flange.translation
-    _, by_q = project_with_jacobian(
-        (from_flange @ Ra - state.flange_from_camera.translation) @ Rx, state.intrinsics
-    )  # fmt: skip
-    camera_from_base = (Ra @ Rx).T
-    by_arm = np.concatenate(
-        [-by_q @ camera_from_base, by_q @ (camera_from_base @ np.array([skew(p) for p in from_flange]))], axis=2
-    ).reshape(-1, 6)
+    _, J = residual(view, points_m, state, known.disc_m)
+    # A motion of the flange has the effect of the opposite motion of the target, about the flange.
+    lever = skew(state.base_from_target.translation - view.base_from_flange.translation)
+    by_arm = np.hstack([-J[:, 6:9], J[:, 6:9] @ lever - J[:, 9:12]])
     arm = np.diag([known.arm_m**2] * 3 + [known.arm_rad**2] * 3)
-    noise = by_arm @ arm @ by_arm.T
-    for k, covariance in enumerate(view.covariance_px):
-        noise[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += covariance
-    return np.asarray(noise)
+    return np.asarray(by_arm @ arm @ by_arm.T + block_diag(*view.covariance_px))
 
 
 def chi_square(view: InHandView, points_m: Array, state: InHandState, known: Beforehand) -> float:

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
-from hal.camera_model import disc_offset_px, distort, distortion_jacobian, project, undistort_pixels
+from hal.camera_model import disc_offset_px, distort, project, project_with_jacobian, undistort_pixels
 from hal.errors import InvalidRequest, NotObservable
-from hal.geometry import matrix_of, perturbed, transform
+from hal.geometry import matrix_of, perturbed
 from hal.least_squares import Minimum, descend
 from perception.calibration.boards import FEWEST_POINTS, BoardView
 from perception.calibration.cubic_lens import CubicLens, fit_cubic
@@ -43,7 +44,6 @@ class CameraCalibration:
         cubic: the paper's correction, fitted to the same points; its bias is the part of the distortion over the image
         that
             it cannot represent.
-        cubic_covariance: (10, 10) of one column of its coefficients, px^2.
     """
 
     intrinsics: CameraIntrinsics
@@ -55,28 +55,21 @@ class CameraCalibration:
     degrees: int
     board_poses: tuple[RigidTransform, ...]
     cubic: CubicLens
-    cubic_covariance: Array
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _State:
-    """Intrinsics and board poses during the fit."""
-
-    intrinsics: CameraIntrinsics
-    poses: tuple[RigidTransform, ...]
+State = tuple[CameraIntrinsics, tuple[RigidTransform, ...]]
+"""Intrinsics and board poses during the fit."""
 
 
 def calibrate_camera(
-    views: Sequence[BoardView], image_size_px: tuple[int, int], *, free: Sequence[str] = BOARD_FREE,
-    start: CameraIntrinsics | None = None,
-) -> CameraCalibration:  # fmt: skip
+    views: Sequence[BoardView], image_size_px: tuple[int, int], *, free: Sequence[str] = BOARD_FREE
+) -> CameraCalibration:
     """Estimate intrinsics, lens and board poses from three or more views.
 
     Args:
-        views: known points in images; the boards must be flat unless `start` is given. `LIGHTS_FREE` suits four lights.
+        views: known points of flat boards in images. `LIGHTS_FREE` suits four lights.
         image_size_px: (width, height).
-        free: which of `NAMES` to fit; the others keep their value in `start`, or 0 for the lens.
-        start: rough intrinsics; if None, they are computed from the views (Zhang).
+        free: which of `NAMES` to fit; of the lens the others are 0.
 
     Raises:
         InvalidRequest: too few views or points, unknown names, not finite.
@@ -86,32 +79,27 @@ def calibrate_camera(
     Source: Zhang, IEEE PAMI 22(11), 2000.
     """
     _check(views, free)
-    guess = start if start is not None else _zhang(views, image_size_px)
-    poses = tuple(_first_pose(view, guess) for view in views)
+    guess = _rough(views, image_size_px)
+    state: State = (guess, tuple(_first_pose(view, guess) for view in views))
     index = [NAMES.index(name) for name in NAMES if name in free]
     # The first fit is without distortion, over focal lengths and poses only; the second is over all parameters.
-    state = _State(intrinsics=guess, poses=poses)
-    if start is None:
-        state, _ = _fit(views, state, [i for i in index if i < 2])
+    state, _ = _fit(views, state, [i for i in index if i < 2])
     state, _ = _fit(views, state, index)
-    views = [_cleaned(view, pose, state.intrinsics) for view, pose in zip(views, state.poses, strict=True)]
-    state, minimum = _fit(views, state, index)
+    views = [_cleaned(view, pose, state[0]) for view, pose in zip(views, state[1], strict=True)]
+    (intrinsics, poses), minimum = _fit(views, state, index)
     n = len(index)
     degrees = 2 * sum(len(view.points_m) for view in views) - n - 6 * len(views)
     # Residuals larger than the stated noise explains make all parameters less certain, in proportion.
     covariance = minimum.covariance[:n, :n] * max(1.0, minimum.chi_square / degrees)
-    _check_accuracy(covariance, [NAMES[i] for i in index], state.intrinsics)
+    _check_accuracy(covariance, [NAMES[i] for i in index], intrinsics)
     residuals = tuple(
-        view.pixels_px - project(pose.apply(view.points_m), state.intrinsics)
-        for view, pose in zip(views, state.poses, strict=True)
+        view.pixels_px - project(pose.apply(view.points_m), intrinsics) for view, pose in zip(views, poses, strict=True)
     )
     stacked = np.concatenate(residuals)
-    cubic, cubic_covariance = fit_cubic(views, state.intrinsics, state.poses)
     return CameraCalibration(
-        intrinsics=state.intrinsics, names=tuple(NAMES[i] for i in index), covariance=covariance,
+        intrinsics=intrinsics, names=tuple(NAMES[i] for i in index), covariance=covariance,
         rms_px=float(np.sqrt(np.mean(stacked**2))), residuals_px=residuals, chi_square=minimum.chi_square,
-        degrees=degrees, board_poses=state.poses, cubic=cubic,
-        cubic_covariance=cubic_covariance,
+        degrees=degrees, board_poses=poses, cubic=fit_cubic(views, intrinsics, poses),
     )  # fmt: skip
 
 
@@ -147,70 +135,30 @@ def _check(views: Sequence[BoardView], free: Sequence[str]) -> None:
         raise InvalidRequest("fewer measurements than unknowns", hint="add views, or fit fewer parameters")
 
 
-def _homography(view: BoardView) -> Array:
-    """Return the homography (3, 3) from board x, y to pixels, by direct linear transform with Hartley's scaling."""
-    plane, pixels = view.points_m[:, :2], view.pixels_px
-    Ta, Tb = _scaling(plane), _scaling(pixels)
-    a = np.column_stack([plane, np.ones(len(plane))]) @ Ta.T
-    b = np.column_stack([pixels, np.ones(len(pixels))]) @ Tb.T
-    zero = np.zeros_like(a)
-    rows = np.vstack([np.hstack([a, zero, -b[:, :1] * a]), np.hstack([zero, a, -b[:, 1:2] * a])])
-    H = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    return np.asarray(np.linalg.inv(Tb) @ H @ Ta)
-
-
-def _scaling(points: Array) -> Array:
-    """Return the similarity (3, 3) that moves the centroid of points (N, 2) to zero and their mean square to one."""
-    centre = points.mean(axis=0)
-    size = float(np.sqrt(np.mean((points - centre) ** 2))) or 1.0
-    return np.array([[1 / size, 0, -centre[0] / size], [0, 1 / size, -centre[1] / size], [0, 0, 1]])
-
-
-def _zhang(views: Sequence[BoardView], size: tuple[int, int]) -> CameraIntrinsics:
-    """Compute focal lengths from the homographies, with the principal point in the middle of the image.
-
-    With K^-1 H = (h1 h2 h3): h1 . h2 = 0 and |h1| = |h2| are linear in 1/fx^2 and 1/fy^2.
-    """
+def _rough(views: Sequence[BoardView], size: tuple[int, int]) -> CameraIntrinsics:
+    """Return focal lengths from the views of flat boards (Zhang), with the principal point in the middle of the image."""
     width, height = size
-    centre = np.array([[1, 0, -(width - 1) / 2.0], [0, 1, -(height - 1) / 2.0], [0, 0, 1]])
-    rows, values = [], []
-    for view in views:
-        H = centre @ _homography(view)
-        H = H / np.linalg.norm(H[:, :2])
-        (a1, b1, c1), (a2, b2, c2) = H[:, 0], H[:, 1]
-        rows += [[a1 * a2, b1 * b2], [a1**2 - a2**2, b1**2 - b2**2]]
-        values += [-c1 * c2, c2**2 - c1**2]
-    inverse = np.linalg.lstsq(np.array(rows) * width**-2, np.array(values), rcond=None)[0] * width**-2
-    focal = 1.2 * width * np.ones(2)  # a usual lens; frontal views do not determine the focal lengths
-    if (inverse > 0).all():
-        found = 1.0 / np.sqrt(inverse)
-        focal = np.where((found > 0.3 * width) & (found < 8.0 * width), found, focal)
+    points = [np.column_stack([v.points_m[:, :2], np.zeros(len(v.points_m))]).astype(np.float32) for v in views]
+    pixels = [view.pixels_px.astype(np.float32) for view in views]
+    focal = np.diag(np.asarray(cv2.initCameraMatrix2D(points, pixels, size, aspectRatio=0.0), float))[:2]
+    # Frontal views do not determine the focal lengths; 1.2 widths is a usual lens.
+    fx, fy = np.where((focal > 0.3 * width) & (focal < 8.0 * width), focal, 1.2 * width)
     return CameraIntrinsics(
-        width_px=width, height_px=height, fx_px=float(focal[0]), fy_px=float(focal[1]), cx_px=(width - 1) / 2.0,
+        width_px=width,
+        height_px=height,
+        fx_px=float(fx),
+        fy_px=float(fy),
+        cx_px=(width - 1) / 2.0,
         cy_px=(height - 1) / 2.0,
-    )  # fmt: skip
+    )
 
 
 def _first_pose(view: BoardView, intrinsics: CameraIntrinsics) -> RigidTransform:
-    """Return camera_from_board from the homography of the undistorted pixels (flat), else by OpenCV's SQPNP."""
+    """Return a rough camera_from_board."""
+    K = np.array([[intrinsics.fx_px, 0, intrinsics.cx_px], [0, intrinsics.fy_px, intrinsics.cy_px], [0, 0, 1.0]])
     ideal = undistort_pixels(view.pixels_px, intrinsics)
-    K = np.array([
-        [intrinsics.fx_px, 0, intrinsics.cx_px], [0, intrinsics.fy_px, intrinsics.cy_px], [0, 0, 1.0]
-    ])  # fmt: skip
-    if np.ptp(view.points_m[:, 2]) > 1e-9:
-        import cv2
-
-        _, turn, shift = cv2.solvePnP(view.points_m, ideal, K, None, flags=cv2.SOLVEPNP_SQPNP)
-        return transform(Rotation.from_rotvec(np.asarray(turn).ravel()).as_matrix(), np.asarray(shift).ravel())
-    h = np.linalg.inv(K) @ _homography(BoardView(points_m=view.points_m, pixels_px=ideal, sigma_px=view.sigma_px))
-    h = h / np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
-    t = h[:, 2]
-    if t[2] < 0:
-        h, t = -h, -t
-    u, _, vt = np.linalg.svd(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
-    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    height = float(view.points_m[0, 2])
-    return transform(R, t - R @ [0.0, 0.0, height])
+    _, turn, shift = cv2.solvePnP(view.points_m, ideal, K, None, flags=cv2.SOLVEPNP_SQPNP)
+    return RigidTransform.from_components(np.asarray(shift).ravel(), Rotation.from_rotvec(np.asarray(turn).ravel()))
 
 
 def parameters(intrinsics: CameraIntrinsics) -> Array:
@@ -222,11 +170,9 @@ def parameters(intrinsics: CameraIntrinsics) -> Array:
 
 def with_parameters(intrinsics: CameraIntrinsics, values: Array) -> CameraIntrinsics:
     """Return the intrinsics with the values (9,) of `NAMES`."""
-    fx, fy, cx, cy, *lens = (float(v) for v in values)
-    return CameraIntrinsics(
-        width_px=intrinsics.width_px, height_px=intrinsics.height_px, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy,
-        distortion=(lens[0], lens[1], lens[2], lens[3], lens[4]),
-    )  # fmt: skip
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(v) for v in values)
+    lens = (k1, k2, p1, p2, k3)
+    return replace(intrinsics, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=lens)
 
 
 def lens_jacobian(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
@@ -246,26 +192,7 @@ def lens_jacobian(normalised: Array, intrinsics: CameraIntrinsics) -> Array:
     return by_lens
 
 
-def _projection(view: BoardView, pose: RigidTransform, intrinsics: CameraIntrinsics) -> tuple[Array, Array, Array]:
-    """Return the pixels (N, 2) and their derivatives with respect to the intrinsics (2N, 9) and to the pose (2N, 6)."""
-    turned = view.points_m @ matrix_of(pose).T
-    q = turned + pose.translation
-    z = np.maximum(q[:, 2], 1e-6)
-    n = q[:, :2] / z[:, None]
-    d = distort(n, intrinsics)
-    focal = np.array([intrinsics.fx_px, intrinsics.fy_px])
-    by_lens = lens_jacobian(n, intrinsics)
-    by_point = np.zeros((len(n), 2, 3))
-    by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
-    by_point[:, :, 2] = -n / z[:, None]
-    by_point = focal[:, None] * (distortion_jacobian(n, intrinsics) @ by_point)
-    by_turn = np.cross(turned[:, None, :], by_point)  # a . (r x y) = r . (y x a)
-    by_pose = np.concatenate([by_point, by_turn], axis=2)
-    pixels = d * focal + [intrinsics.cx_px, intrinsics.cy_px]
-    return np.asarray(pixels), by_lens.reshape(-1, 9), by_pose.reshape(-1, 6)
-
-
-def _fit(views: Sequence[BoardView], start: _State, index: list[int]) -> tuple[_State, Minimum]:
+def _fit(views: Sequence[BoardView], start: State, index: list[int]) -> tuple[State, Minimum]:
     """Fit the parameters `index` of `NAMES` and all board poses by nonlinear least squares.
 
     Raises:
@@ -273,22 +200,27 @@ def _fit(views: Sequence[BoardView], start: _State, index: list[int]) -> tuple[_
     """
     n = len(index)
 
-    def linearise(state: _State) -> tuple[Array, Array]:
+    def linearise(state: State) -> tuple[Array, Array]:
+        intrinsics, poses = state
         residuals, rows = [], []
-        for k, (view, pose) in enumerate(zip(views, state.poses, strict=True)):
-            pixels, by_lens, by_pose = _projection(view, pose, state.intrinsics)
-            row = np.zeros((2 * len(pixels), n + 6 * len(views)))
-            row[:, :n] = by_lens[:, index]
-            row[:, n + 6 * k : n + 6 * k + 6] = by_pose
+        for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
+            turned = view.points_m @ matrix_of(pose).T
+            q = turned + pose.translation
+            pixels, by_point = project_with_jacobian(q, intrinsics)
+            row = np.zeros((len(q), 2, n + 6 * len(views)))
+            row[:, :, :n] = lens_jacobian(q[:, :2] / q[:, 2:], intrinsics)[:, :, index]
+            row[:, :, n + 6 * k : n + 6 * k + 3] = by_point
+            row[:, :, n + 6 * k + 3 : n + 6 * k + 6] = np.cross(turned[:, None], by_point)  # a . (r x y) = r . (y x a)
             residuals.append((pixels - view.pixels_px).ravel() / view.sigma_px)
-            rows.append(row / view.sigma_px)
+            rows.append(row.reshape(2 * len(q), -1) / view.sigma_px)
         return np.concatenate(residuals), np.vstack(rows)
 
-    def move(state: _State, step: Array) -> _State:
-        values = parameters(state.intrinsics)
+    def move(state: State, step: Array) -> State:
+        intrinsics, poses = state
+        values = parameters(intrinsics)
         values[index] += step[:n]
-        poses = tuple(perturbed(pose, step[n + 6 * k : n + 6 * k + 6]) for k, pose in enumerate(state.poses))
-        return _State(intrinsics=with_parameters(state.intrinsics, values), poses=poses)
+        moved = (perturbed(pose, step[n + 6 * k : n + 6 * k + 6]) for k, pose in enumerate(poses))
+        return with_parameters(intrinsics, values), tuple(moved)
 
     try:
         return descend(start, linearise, move)

@@ -43,13 +43,11 @@ class ScannerCalibration:
 
     Attributes:
         flange_from_scanner: with covariance.
-        plane_base: the plate's unit normal n (3,) and offset d (n . X = d), base frame, m.
         chi_square, degrees: chi-square of the fit and its degrees of freedom.
         rms_m: root mean square distance of all points from the plate.
     """
 
     flange_from_scanner: UncertainPose
-    plane_base: tuple[Array, float]
     chi_square: float
     degrees: int
     rms_m: float
@@ -89,19 +87,14 @@ def calibrate_scanner(
         if all(len(new.points_m) == len(old.points_m) for new, old in zip(kept, scans, strict=True)):
             break
         scans = kept
-    pose, bends = state
     degrees = sum(len(scan.points_m) for scan in scans) - 6
     # Residuals larger than the stated noise explains make all parameters less certain, in proportion.
     covariance = minimum.covariance[:6, :6] * max(1.0, minimum.chi_square / degrees)
     _check(covariance)
-    frame, origin = matrix_of(base_from_plate.parent_from_child), base_from_plate.parent_from_child.translation
-    n = frame[:, 2] + frame[:, :2] @ bends[:2]
-    length = float(np.linalg.norm(n))
     rest_m = np.concatenate([scan.heights(state, k, base_from_plate) for k, scan in enumerate(scans)])
     return ScannerCalibration(
-        flange_from_scanner=UncertainPose(parent_from_child=pose, covariance=covariance),
-        plane_base=(n / length, float((n @ origin + bends[2]) / length)),
-        chi_square=minimum.chi_square, degrees=degrees, rms_m=float(np.sqrt(np.mean(rest_m**2))),
+        flange_from_scanner=UncertainPose(parent_from_child=state[0], covariance=covariance), chi_square=minimum.chi_square,
+        degrees=degrees, rms_m=float(np.sqrt(np.mean(rest_m**2))),
     )  # fmt: skip
 
 

@@ -81,7 +81,6 @@ def test_the_cubic_correction_reports_its_bias() -> None:
     rms = float(np.sqrt(np.mean(np.sum(miss**2, axis=1))))
     assert rms < 3.0 * result.cubic.bias_px + 0.1
     assert 0.01 < result.cubic.bias_px < 2.0  # more data would not remove it
-    assert result.cubic_covariance.shape == (10, 10)
 
 
 def test_the_panels_own_lights_are_a_board() -> None:

@@ -12,6 +12,8 @@ from perception.vision.quadrangle.cost import chi_square, find_minimum, turn_ont
 from perception.vision.quadrangle.small_vectors import cross3, dot3, mix3, product3, times3, unit3
 from perception.vision.quadrangle.three_point import three_point
 
+MOST_MINIMA = 6
+
 
 @inlined
 def rotation_distance(A: Array, B: Array) -> float:
@@ -65,11 +67,11 @@ def mirrored(R: Array, t: Array, normal: Array) -> Array:
 
 
 @compiled
-def all_minima(X: Array, m: Array, A: Array, normal: Array, Rs: Array, ts: Array, costs: Array, Ns: Array) -> int:
-    """Find the distinct local minima of chi-square, lowest first; fills Rs (M,3,3), ts, costs, Ns (M,6,6).
+def all_minima(X: Array, m: Array, A: Array, normal: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the distinct local minima of chi-square: R (M,3,3), t (M,3), chi-square (M,), N (M,6,6).
 
     The starts are the best three-point pose, the mirror of its minimum, then every three-point pose that is far from
-    earlier starts and minima. Returns the number of minima; Ns are their Gauss-Newton matrices.
+    earlier starts and minima. N are their Gauss-Newton matrices.
     """
     f = np.empty((4, 3))
     for i in range(4):
@@ -77,7 +79,8 @@ def all_minima(X: Array, m: Array, A: Array, normal: Array, Rs: Array, ts: Array
         f[i, 0], f[i, 1], f[i, 2] = m[i, 0] / norm, m[i, 1] / norm, 1.0 / norm
     R_seed, t_seed, c_seed = np.empty((16, 3, 3)), np.empty((16, 3)), np.empty(16)
     available = ordered_seeds(X, f, m, A, R_seed, t_seed, c_seed)
-    limit = Rs.shape[0]
+    Rs, ts = np.empty((MOST_MINIMA, 3, 3)), np.empty((MOST_MINIMA, 3))
+    costs, Ns = np.empty(MOST_MINIMA), np.empty((MOST_MINIMA, 6, 6))
     started = np.empty((8, 3, 3))
     runs = 0
     count = 0
@@ -110,18 +113,11 @@ def all_minima(X: Array, m: Array, A: Array, normal: Array, Rs: Array, ts: Array
         known = False
         for k in range(count):
             known = known or (rotation_distance(R, Rs[k]) < 1e-5 and abs(cost - costs[k]) < 1e-3 * (1.0 + cost))
-        if known or count == limit:
+        if known or count == MOST_MINIMA:
             continue
-        k = count
-        while k > 0 and costs[k - 1] > cost:
-            put2(Rs[k], Rs[k - 1])
-            put1(ts[k], ts[k - 1])
-            put2(Ns[k], Ns[k - 1])
-            costs[k] = costs[k - 1]
-            k -= 1
-        put2(Rs[k], R)
-        put1(ts[k], t)
-        put2(Ns[k], N)
-        costs[k] = cost
+        put2(Rs[count], R)
+        put1(ts[count], t)
+        put2(Ns[count], N)
+        costs[count] = cost
         count += 1
-    return count
+    return Rs[:count], ts[:count], costs[:count], Ns[:count]

@@ -85,31 +85,6 @@ def _contract(M: Array, direction: Array, out: Array) -> None:
 
 
 @inlined
-def normal_spread(R: Array, t: Array, C: Array, normal: Array) -> tuple[float, float]:
-    """Return the uncertainty of the normal and its distance from the line of sight.
-
-    The first is the area sqrt(det) of the covariance of the normal (sr), the second the squared number of standard
-    deviations by which the normal is tilted from the line of sight.
-    """
-    n = times3(R, normal)
-    k = unit3(t)
-    a = cross3(n, k)
-    sine = np.sqrt(dot3(a, a))
-    tilt = np.arctan2(sine, abs(dot3(n, k)))
-    if sine < 1e-9:
-        a = sight_frame(n)[0]
-    a = unit3(a)
-    b = cross3(n, a)
-    caa = cab = cbb = 0.0
-    for i in range(3):
-        for j in range(3):
-            caa += a[i] * C[3 + i, 3 + j] * a[j]
-            cab += a[i] * C[3 + i, 3 + j] * b[j]
-            cbb += b[i] * C[3 + i, 3 + j] * b[j]
-    return np.sqrt(max(caa * cbb - cab * cab, 0.0)), tilt * tilt / caa
-
-
-@inlined
 def opposite(normal_camera: Array, best: Array, far: float) -> bool:
     """Return whether a normal is nearer to the mirror of the best one than to the best one itself.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +13,8 @@ from hal.arrays import Array
 from hal.errors import PerceptionError
 
 Image = NDArray[np.float32]
+Edges = tuple[NDArray[np.intp], NDArray[np.intp], tuple[Image, Image]]
+"""Rows and columns of pixels of the second image whose gradients constrain the motion, and its gradient images."""
 
 LEAST_AGREEMENT = 0.6  # correlation of the gradients after registration; usually above 0.9, 0.1 for unrelated images
 EDGE_PIXELS = 6_000  # used for the fit; 16 000 gave the same shift within 0.01 px
@@ -63,15 +66,11 @@ def register(first: Image, second: Image, *, noise: float) -> ImageAlignment:
 
     Source: Lucas, Kanade, IJCAI 1981; Kuglin, Hines, 1975.
     """
-    gx, gy = _gradients(second)
-    strength = np.hypot(gx, gy)
-    rows, columns = _strong_edges(strength, least=3.0 * noise)
-    if min(len(rows), len(_strong_edges(np.hypot(*_gradients(first)), least=3.0 * noise)[0])) < FEW_EDGES:
-        return _unmoved(first, second)  # in the dark only the lights themselves have edges
-    start = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    edges, start = _strong_edges(second, least=3.0 * noise), np.eye(3)[:2]
+    if min(len(edges[0]), len(_strong_edges(first, least=3.0 * noise)[0])) < FEW_EDGES:
+        return _result(first, second, None, start)  # in the dark only the lights themselves have edges
     start[:, 2] = _coarse_shift(first, second)
-    edges = _Edges(rows=rows, columns=columns, gradients=(gx, gy))
-    fit = _refine(first, second, edges, start, noise)
+    fit = _result(first, second, edges, _refined(first, second, edges, start, noise))
     if fit.agreement < LEAST_AGREEMENT:
         raise CameraMoved(
             f"the images with lights off and on do not match (edge agreement {fit.agreement:.2f})",
@@ -81,20 +80,11 @@ def register(first: Image, second: Image, *, noise: float) -> ImageAlignment:
     return fit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Edges:
-    """Pixels of the second image whose gradients constrain the motion, and its gradient images."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    gradients: tuple[Image, Image]
-
-
-def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: float) -> ImageAlignment:
-    """Fit shift, rotation, growth, gain and offset by Gauss-Newton steps, starting from an affine map (2, 3)."""
-    rows, columns = edges.rows, edges.columns
+def _refined(first: Image, second: Image, edges: Edges, affine: Array, noise: float) -> Array:
+    """Return the map (2, 3) of a fit of shift, rotation, growth, gain and offset by Gauss-Newton steps from `affine`."""
+    rows, columns, both = edges
     height, width = second.shape
-    gx, gy = (g[rows, columns].astype(float) for g in edges.gradients)
+    gx, gy = (g[rows, columns].astype(float) for g in both)
     x, y = (columns - width / 2.0) / width, (rows - height / 2.0) / width
     target = second[rows, columns].astype(float)
     gain, offset = 1.0, 0.0
@@ -118,13 +108,11 @@ def _refine(first: Image, second: Image, edges: _Edges, affine: Array, noise: fl
         affine = (move @ np.vstack([affine, [0.0, 0.0, 1.0]]))[:2]
         if iteration >= SHIFT_FIRST and np.abs(step[2:4]).max() < 0.01:
             break
-    return _result(first, second, edges, affine)
+    return affine
 
 
-def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> ImageAlignment:
+def _result(first: Image, second: Image, edges: Edges | None, affine: Array) -> ImageAlignment:
     """Resample the first image with the fitted map, and compute gray levels and agreement."""
-    import cv2
-
     height, width = second.shape
     flags = cv2.INTER_CUBIC
     warped = np.asarray(
@@ -133,10 +121,10 @@ def _result(first: Image, second: Image, edges: _Edges, affine: Array) -> ImageA
     inside = cv2.warpAffine(np.ones_like(first), affine, (width, height), flags=cv2.INTER_NEAREST) > 0.5
     gain, offset = _tones(warped[inside], second[inside])
     warped = np.asarray(gain * warped + offset, np.float32)
-    rows, columns = edges.rows, edges.columns
-    a = np.concatenate([g[rows, columns] for g in _gradients(warped)])
-    b = np.concatenate([g[rows, columns] for g in edges.gradients])
-    agreement = _robust_correlation(a, b)
+    agreement = 1.0
+    if edges is not None:
+        a, b = (np.concatenate([g[edges[:2]] for g in both]) for both in (gradients(warped), edges[2]))
+        agreement = _robust_correlation(a, b)
     centre = affine @ [width / 2.0, height / 2.0, 1.0] - [width / 2.0, height / 2.0]
     return ImageAlignment(
         second_from_first=affine, gain=float(gain), offset=float(offset), shift_px=(float(centre[0]), float(centre[1])),
@@ -170,44 +158,33 @@ def _robust_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
     return float((a @ b) / np.sqrt(max((a @ a) * (b @ b), 1e-12)))
 
 
-def _unmoved(first: Image, second: Image) -> ImageAlignment:
-    """Return a registration without motion, for images with too few edges."""
-    gain, offset = _tones(first.ravel(), second.ravel())
-    return ImageAlignment(
-        second_from_first=np.eye(3)[:2], gain=gain, offset=offset, shift_px=(0.0, 0.0),
-        warped=(gain * first + offset).astype(np.float32), inside=np.ones(first.shape, bool), agreement=1.0,
-    )  # fmt: skip
-
-
-def _gradients(image: Image) -> tuple[Image, Image]:
+def gradients(image: Image) -> tuple[Image, Image]:
     """Return the central differences of the slightly smoothed image, gray levels per pixel."""
-    import cv2
-
     return (
         np.asarray(cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)),
         np.asarray(cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)),
     )
 
 
-def _strong_edges(strength: Image, *, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns of the strongest edge pixels, at most about `EDGE_PIXELS`."""
+def _strong_edges(image: Image, *, least: float) -> Edges:
+    """Return the strongest edge pixels of an image, at most about `EDGE_PIXELS`."""
+    both = gradients(image)
+    strength = np.hypot(*both)
     inner = strength[4:-4, 4:-4]
     sample = inner[::4, ::4]
     share = min(1.0, EDGE_PIXELS / max(inner.size, 1))
     limit = max(float(np.quantile(sample, 1.0 - share)) if sample.size else np.inf, least)
     rows, columns = np.nonzero(inner > limit)
-    return rows + 4, columns + 4
+    return rows + 4, columns + 4, both
 
 
 def _coarse_shift(first: Image, second: Image) -> Array:
     """Return the shift (2,) in pixels of the first image's content, accurate to about half a pixel."""
-    import cv2
-
     half = (max(first.shape[1] // 2, 1), max(first.shape[0] // 2, 1))
     maps = []
     for image in (first, second):
         small = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
-        gx, gy = _gradients(np.asarray(small, np.float32))
+        gx, gy = gradients(np.asarray(small, np.float32))
         strength = np.hypot(gx, gy)
         maps.append(np.minimum(strength, np.quantile(strength[::2, ::2], 0.98)))
     (dx, dy), _ = cv2.phaseCorrelate(maps[0], maps[1], cv2.createHanningWindow(half, cv2.CV_32F))

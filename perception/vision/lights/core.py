@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,8 +41,6 @@ def lamp_core(rise: Image, seed: Mask) -> Core | None:
         rise: (H, W) difference of on and off around one region.
         seed: (H, W) the region's pixels that stand out of the noise.
     """
-    import cv2
-
     peak = level_at(rise[seed], 0.99)
     level = _steepest_level(rise, seed, peak)
     body = _component(rise, seed, level)
@@ -79,8 +78,6 @@ def _steepest_level(rise: Image, seed: Mask, peak: float) -> float:
 
 def _component(rise: Image, seed: Mask, level: float) -> NDArray[np.uint8] | None:
     """Return the 4-connected part above the level that shares most pixels with the seed; None if none does."""
-    import cv2
-
     lit = (rise > level).astype(np.uint8)
     _, labels = cv2.connectedComponents(lit, connectivity=4)
     touched = np.bincount(labels[seed & (lit > 0)], minlength=1)

@@ -9,12 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array
 from hal.errors import InvalidRequest
-from perception.vision.lights.alignment import ImageAlignment, register
+from perception.vision.image import check_image
+from perception.vision.lights.alignment import ImageAlignment, gradients, register
 from perception.vision.lights.core import Core, lamp_core, level_at
 
 Image = NDArray[np.float32]
@@ -81,27 +83,18 @@ def find_lights(
     diameter = largest_diameter_px if largest_diameter_px is not None else on.shape[0] / 12.0
     rise = _rise(on, registration, diameter)
     sigma = _noise(rise, registration)
-    regions = _grow(rise, sigma, registration.inside, diameter)
-    return _describe(regions, sigma, registration)
+    return _described(_grow(rise, sigma, registration.inside, diameter), sigma, registration)
 
 
 def gray_of(image: NDArray[Any]) -> Image:
     """Return the float32 gray levels (H, W) of an 8-bit gray or RGB image.
 
     Raises:
-        InvalidRequest: another shape or type, or smaller than 16x16.
+        InvalidRequest: see `check_image`.
     """
-    array = np.asarray(image)
-    if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
-        raise InvalidRequest(
-            f"expected (H, W) or (H, W, 3) with 8 bits, got {array.shape} {array.dtype}", hint="convert the image first"
-        )
-    if min(array.shape[:2]) < 16:
-        raise InvalidRequest(f"image is only {array.shape[1]}x{array.shape[0]}", hint="16x16 is the least")
-    if array.ndim == 3:
-        # The mean and not the luma, in which a blue lamp would be darker than a green one.
-        return np.asarray(array.mean(axis=2), np.float32)
-    return array.astype(np.float32)
+    check_image(image)
+    # The mean and not the luma, in which a blue lamp would be darker than a green one.
+    return np.asarray(image if image.ndim == 2 else image[:, :, :3].mean(axis=2), np.float32)
 
 
 def _raw_noise(off: Image, on: Image) -> float:
@@ -121,8 +114,6 @@ def _raw_noise(off: Image, on: Image) -> float:
 
 def _rise(on: Image, registration: ImageAlignment, diameter: float) -> Image:
     """Return the smoothed difference on - off, without anything that is wider than a lamp (white top-hat)."""
-    import cv2
-
     difference = np.where(registration.inside, on - registration.warped, 0.0).astype(np.float32)
     difference = np.asarray(cv2.blur(difference, (3, 3)))
     half = (difference.shape[1] // 2, difference.shape[0] // 2)
@@ -139,11 +130,8 @@ def _noise(rise: Image, registration: ImageAlignment) -> Image:
 
     sigma^2 = a + b I + c |grad I|^2: read noise, shot noise, and misregistered edges; each from quantiles of this pair.
     """
-    import cv2
-
     base = registration.warped
-    gx = cv2.Sobel(base, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
-    gy = cv2.Sobel(base, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    gx, gy = gradients(base)
     slope2 = np.asarray(gx * gx + gy * gy)
     sample = (slice(2, -2, 3), slice(2, -2, 3))
     level, slope, change = base[sample], slope2[sample], rise[sample]
@@ -176,86 +164,55 @@ def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, floa
     return max(float(np.median(y - b * x)), 0.05), b
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Region:
-    """One blob.
-
-    Attributes:
-        pixels, weights: (n, 2) coordinates and (n,) coverage 0 to 1.
-        top: rise in the middle.
-        sigma: standard deviation of the noise.
-        rim: width of the decrease from 3/4 to 1/4 of the top, over the radius; 0.8 for a Gaussian bump, less for a
-        lamp.
-        surround: unevenness of the rise just outside, over the top; 0 for a lamp, more for a piece of glare.
-    """
-
-    pixels: Array
-    weights: Array
-    top: float
-    sigma: float
-    rim: float
-    surround: float
+Blob = tuple[Array, Array, float, float, float, float, float]
+"""Centre, its covariance, area, contrast, aspect, fill and score."""
+Seed = tuple[float, int, int, NDArray[np.bool_]]
+"""A connected part: the sum of its rise, left and top px, and its mask."""
 
 
-def _grow(rise: Image, sigma: Image, inside: NDArray[np.bool_], diameter: float) -> list[_Region]:
+def _grow(rise: Image, sigma: Image, inside: NDArray[np.bool_], diameter: float) -> list[Blob]:
     """Return the lamp-like parts of the connected regions that stand out of the noise."""
-    regions = []
+    found = []
     margin = 8
     seeds = _seeds(rise, (rise > SEED_SIGMAS * sigma) & inside, diameter)
-    seeds.sort(key=lambda seed: -seed.brightness)
-    for seed in seeds[: 2 * MOST_BLOBS]:
-        x, y, (h, w) = seed.left, seed.top, seed.mask.shape
+    for _, x, y, mask in sorted(seeds, key=lambda seed: -seed[0])[: 2 * MOST_BLOBS]:
+        h, w = mask.shape
         x0, y0 = max(x - margin, 0), max(y - margin, 0)
         window = (slice(y0, y + h + margin), slice(x0, x + w + margin))
         padded = np.zeros(rise[window].shape, bool)
-        padded[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = seed.mask
-        region = _region(rise[window], sigma[window], padded, (x0, y0))
-        if region is not None:
-            regions.append(region)
-    return regions
+        padded[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = mask
+        blob = _measured(rise[window], sigma[window], padded, (x0, y0))
+        if blob is not None:
+            found.append(blob)
+    return found
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Seed:
-    """A connected part: its position in the image, its mask, and the sum of its rise."""
-
-    left: int
-    top: int
-    mask: NDArray[np.bool_]
-    brightness: float
-
-
-def _seeds(rise: Image, lit: NDArray[np.bool_], diameter: float) -> list[_Seed]:
+def _seeds(rise: Image, lit: NDArray[np.bool_], diameter: float) -> list[Seed]:
     """Return connected parts that are neither specks nor streaks.
 
     Those too large for a lamp are split at half their height. The glow that connects a lamp with its surroundings is
     lower than the lamp, so splitting separates the lamp.
     """
-    import cv2
-
     _, labels, stats, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8), connectivity=8)
     wide, high, area = stats[1:, 2], stats[1:, 3], stats[1:, 4]
     large = np.maximum(wide, high) > 1.5 * diameter
     compact = (np.maximum(wide, high) <= 4 * np.minimum(wide, high) + 4) & (area >= 0.3 * wide * high)
     usable = np.flatnonzero((area >= 3) & (large | compact))
-    found = []
+    found: list[Seed] = []
     for k in usable[np.argsort(-area[usable])][: 8 * MOST_BLOBS] + 1:
         x, y, w, h = (int(v) for v in stats[k][:4])
         part, inner = labels[y : y + h, x : x + w] == k, rise[y : y + h, x : x + w]
         if not large[k - 1]:
-            found.append(_Seed(left=x, top=y, mask=part, brightness=float(inner[part].sum())))
+            found.append((float(inner[part].sum()), x, y, part))
             continue
         level = 0.5 * (float(np.quantile(inner[part], 0.999)) + float(inner[part].min()))
         higher = part & (inner > level)
         if 3 <= higher.sum() < part.sum():
-            found += [
-                _Seed(left=x + s.left, top=y + s.top, mask=s.mask, brightness=s.brightness)
-                for s in _seeds(inner, higher, diameter)
-            ]
+            found += [(total, x + u, y + v, mask) for total, u, v, mask in _seeds(inner, higher, diameter)]
     return found
 
 
-def _region(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[int, int]) -> _Region | None:
+def _measured(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[int, int]) -> Blob | None:
     """Measure the lamp in a connected part; None if it is too small, or only the rim of something brighter.
 
     `corner`: column and row at which the window `rise` begins in the image.
@@ -266,21 +223,31 @@ def _region(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[in
     if core.top > 1.3 * level_at(rise[seed], 0.99):
         return None  # the rim of something brighter, which has its own seed
     rows, columns = np.nonzero(core.weights > 0.05)
-    rim, surround = _edge_quality(rise, core)
-    return _Region(
-        pixels=np.column_stack([columns + corner[0], rows + corner[1]]).astype(float),
-        weights=core.weights[rows, columns].astype(float),
-        top=core.top - core.glow,
-        sigma=float(np.sqrt(np.mean(sigma[rows, columns] ** 2))),
-        rim=rim,
-        surround=surround,
-    )
+    w, contrast = core.weights[rows, columns].astype(float), core.top - core.glow
+    area = float(w.sum())
+    pixels = np.column_stack([columns + corner[0], rows + corner[1]]).astype(float)
+    centre = w @ pixels / area
+    e = pixels - centre
+    moments = (w[:, None] * e).T @ e / area
+    low, high = np.linalg.eigvalsh(moments)
+    aspect = float(np.sqrt(max(low, 1e-3) / max(high, 1e-3)))
+    fill = area / (4.0 * np.pi * np.sqrt(max(low * high, 1e-6)))  # a uniform ellipse has area 4 pi sqrt(det moments)
+    noise = float(np.sqrt(np.mean(sigma[rows, columns] ** 2)))
+    # d centre = sum e dw / area with dw = noise / top; the factor 3 is because smoothing correlates neighbours.
+    covariance = 3.0 * (noise / contrast / area) ** 2 * (e.T @ e) + CENTRE_FLOOR_PX**2 * np.eye(2)
+    sigmas = contrast / noise
+    clear = min(sigmas / CLEAR_SIGMAS, 1.0) * min(sigmas * np.sqrt(area) / CLEAR_BLOB_SIGMAS, 1.0)
+    round_ = min(aspect / 0.5, 1.0)
+    full = float(np.exp(-0.5 * ((fill - 0.96) / 0.1) ** 2))
+    return centre, covariance, area, contrast, aspect, fill, clear * round_ * full * _edge_quality(rise, core)
 
 
-def _edge_quality(rise: Image, core: Core) -> tuple[float, float]:
-    """Return `rim` and `surround` of a region."""
-    import cv2
+def _edge_quality(rise: Image, core: Core) -> float:
+    """Return 0 to 1, how sharp the edge of a region is, and how even the rise just outside.
 
+    The decrease from 3/4 to 1/4 of the top is 0.8 radii wide for a Gaussian bump, and less for a lamp. A lamp lights the
+    plate around it, by up to 0.55 of its own rise if the image saturates; glare has no plateau.
+    """
     square = np.ones((3, 3), np.uint8)
     reach = cv2.dilate((core.weights > 0.05).astype(np.uint8), square)
     ring = (cv2.dilate(reach, square, iterations=3) > 0) & (reach == 0)
@@ -288,15 +255,16 @@ def _edge_quality(rise: Image, core: Core) -> tuple[float, float]:
     outer, middle, inner = (
         np.sqrt(float((rise[reach > 0] > core.glow + share * step).sum())) for share in (0.25, 0.5, 0.75)
     )
+    rim = (outer - inner) / max(middle, 1.0)
     uneven = level_at(np.abs(rise[ring] - core.glow), 0.5) / step if ring.any() else 0.0
-    return (outer - inner) / max(middle, 1.0), uneven
+    sharp = float(np.exp(-0.5 * (max(rim - 0.4, 0.0) / 0.15) ** 2))
+    alone = float(np.exp(-0.5 * (max(uneven - 0.55, 0.0) / 0.15) ** 2))
+    return sharp * alone
 
 
-def _describe(regions: list[_Region], sigma: Image, registration: ImageAlignment) -> LightBlobs:
-    """Return the regions as blobs, best first."""
-    rows = [row for row in map(_measure, regions) if row[4] >= LEAST_ASPECT]
-    rows.sort(key=lambda row: -row[6])
-    rows = rows[:MOST_BLOBS]
+def _described(blobs: list[Blob], sigma: Image, registration: ImageAlignment) -> LightBlobs:
+    """Return the blobs, best first."""
+    rows = sorted((blob for blob in blobs if blob[4] >= LEAST_ASPECT), key=lambda blob: -blob[6])[:MOST_BLOBS]
     threshold = SEED_SIGMAS * float(np.median(sigma[::8, ::8]))
     column = [np.array([row[i] for row in rows]) for i in range(7)]
     return LightBlobs(
@@ -304,24 +272,3 @@ def _describe(regions: list[_Region], sigma: Image, registration: ImageAlignment
         contrast=column[3], aspect=column[4], fill=column[5], score=column[6], threshold=threshold,
         shift_px=registration.shift_px,
     )  # fmt: skip
-
-
-def _measure(region: _Region) -> tuple[Array, Array, float, float, float, float, float]:
-    """Return centre, its covariance, area, contrast, aspect, fill and score of one region."""
-    w, area = region.weights, float(region.weights.sum())
-    centre = w @ region.pixels / area
-    e = region.pixels - centre
-    moments = (w[:, None] * e).T @ e / area
-    low, high = np.linalg.eigvalsh(moments)
-    aspect = float(np.sqrt(max(low, 1e-3) / max(high, 1e-3)))
-    fill = area / (4.0 * np.pi * np.sqrt(max(low * high, 1e-6)))  # a uniform ellipse has area 4 pi sqrt(det moments)
-    # d centre = sum e dw / area with dw = noise / top; the factor 3 is because smoothing correlates neighbours.
-    covariance = 3.0 * (region.sigma / region.top / area) ** 2 * (e.T @ e) + CENTRE_FLOOR_PX**2 * np.eye(2)
-    sigmas = region.top / region.sigma
-    clear = min(sigmas / CLEAR_SIGMAS, 1.0) * min(sigmas * np.sqrt(area) / CLEAR_BLOB_SIGMAS, 1.0)
-    round_ = min(aspect / 0.5, 1.0)
-    full = float(np.exp(-0.5 * ((fill - 0.96) / 0.1) ** 2))
-    sharp = float(np.exp(-0.5 * (max(region.rim - 0.4, 0.0) / 0.15) ** 2))
-    # A lamp lights the plate around it, by up to 0.55 of its own rise if the image saturates; glare has no plateau.
-    alone = float(np.exp(-0.5 * (max(region.surround - 0.55, 0.0) / 0.15) ** 2))
-    return centre, covariance, area, region.top, aspect, fill, clear * round_ * full * sharp * alone

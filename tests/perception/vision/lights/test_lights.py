@@ -165,7 +165,7 @@ def test_a_dark_room_without_any_texture_still_shows_its_lights() -> None:
         (np.zeros((480, 640), np.uint16), np.zeros((480, 640), np.uint16), "8 bits"),
         (np.zeros((480, 640), np.uint8), np.zeros((240, 320), np.uint8), "sizes differ"),
         (np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.uint8), "1x1"),
-        (np.zeros((480, 640, 4), np.uint8), np.zeros((480, 640, 4), np.uint8), "8 bits"),
+        (np.zeros((480, 640, 2), np.uint8), np.zeros((480, 640, 2), np.uint8), r"not \(480, 640, 2\)"),
     ],
 )
 def test_what_is_no_image_pair_is_refused(off: NDArray[np.uint8], on: NDArray[np.uint8], words: str) -> None:

@@ -30,13 +30,11 @@ class MeasuredCorners:
 
     Attributes:
         points_px: (4, 2); `covariance_px`: (4, 2, 2) of edge noise.
-        sides_seen: (4,) share of the samples of the side from each corner to the next that lie on its line.
         edge_normals_px: (4, 2, 2) for each corner the unit normals of the two sides that meet there.
     """
 
     points_px: Array
     covariance_px: Array
-    sides_seen: Array
     edge_normals_px: Array
 
 
@@ -54,32 +52,31 @@ def measure_corners(
     predicted = view.project(corners_m)
     if not np.isfinite(predicted).all():
         return None
-    lines, variances, seen, normals = np.empty((4, 2)), np.empty((4, 2)), np.empty(4), np.empty((4, 2))
+    lines, variances, normals = np.empty((4, 2)), np.empty((4, 2)), np.empty((4, 2))
     for k in range(4):
         side = _fit_side(image, view, corners_m[k], corners_m[(k + 1) % 4], corners_m.mean(axis=0), window_px)
         if side is None:
             return None
-        lines[k], variances[k], seen[k], normals[k] = side
+        lines[k], variances[k], normals[k] = side
     variances += bias_px[:, None] ** 2
-    points, covariances, meeting = np.empty((4, 2)), np.empty((4, 2, 2)), np.empty((4, 2, 2))
-    for k in range(4):
-        before = (k - 1) % 4
-        n = np.stack([normals[before], normals[k]])
-        back = np.linalg.inv(n)
-        points[k] = predicted[k] + back @ [lines[before, 1], lines[k, 0]]
-        half = back * np.sqrt([variances[before, 1], variances[k, 0]])
-        covariances[k] = half @ half.T
-        meeting[k] = n
-    return MeasuredCorners(points_px=points, covariance_px=covariances, sides_seen=seen, edge_normals_px=meeting)
+    before = np.roll(np.arange(4), 1)  # of the sides that meet at a corner, the one before it and the one after it
+    meeting = np.stack([normals[before], normals], axis=1)
+    back = np.linalg.inv(meeting)
+    offsets = np.column_stack([lines[before, 1], lines[:, 0]])
+    half = back * np.sqrt(np.column_stack([variances[before, 1], variances[:, 0]]))[:, None]
+    return MeasuredCorners(
+        points_px=predicted + (back @ offsets[:, :, None])[:, :, 0], covariance_px=half @ half.swapaxes(1, 2),
+        edge_normals_px=meeting,
+    )  # fmt: skip
 
 
 def _fit_side(
     image: EdgeImage, view: CameraProjection, start_m: Array, end_m: Array, middle_m: Array, window_px: float
-) -> tuple[Array, Array, float, Array] | None:
+) -> tuple[Array, Array, Array] | None:
     """Fit a line to the edges along one side.
 
-    Returns: offsets (2,) px of the line at start and end, their variances (2,), the share of the samples on the line,
-    and the unit normal (2,) in the image; None if too few samples show an edge.
+    Returns: offsets (2,) px of the line at start and end, their variances (2,), and the unit normal (2,) in
+    the image; None if too few samples show an edge.
     """
     length_px = float(np.linalg.norm(np.diff(view.project(np.stack([start_m, end_m])), axis=0)))
     count = int(np.clip(length_px / SAMPLE_PX, LEAST_SAMPLES, MOST_SAMPLES))
@@ -100,7 +97,7 @@ def _fit_side(
     if ok.sum() < max(LEAST_SAMPLES / 2, LEAST_SEEN * count):
         return None
     A = np.column_stack([1.0 - s[ok], s[ok]])
-    r, w = offset[ok], np.ones(int(ok.sum()))
+    r = offset[ok]
     line = np.full(2, float(np.median(r)))
     for _ in range(8):
         e = r - A @ line
@@ -113,4 +110,4 @@ def _fit_side(
     if on_line.sum() < LEAST_SEEN * count:
         return None
     spread = np.linalg.inv(A[on_line].T @ A[on_line]) * scale**2
-    return line, np.diag(spread).copy(), float(on_line.sum() / count), normal
+    return line, np.diag(spread).copy(), normal

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.special import chdtrc
 
 from hal.arrays import Array, Image
 from hal.calibration import CameraIntrinsics
@@ -25,9 +24,9 @@ from perception.vision.finding.blind import Detection, candidate_places, chosen,
 from perception.vision.finding.features import look_at
 from perception.vision.image import as_gray
 from perception.vision.knowledge import Knowledge
-from perception.vision.lights.panel_finder import MODEL_SIGMA_PX, WRONG_FIT_P, PanelPrior, allowed_pose
+from perception.vision.lights.panel_finder import MODEL_SIGMA_PX, PanelPrior
 from perception.vision.panel_ways.points import pose_from_points
-from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, WrongMark
+from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, check_fit, sighting
 from perception.vision.projection import CameraProjection
 from perception.vision.registration.rims import RimView, find_rims
 
@@ -61,32 +60,16 @@ def find_by_looks(
     check_size(gray, intrinsics)
     rough = _recognised(gray, panel, intrinsics, knowledge, prior)
     rims = _rims(gray, panel, intrinsics, rough)
-    points_m = np.array([rim.point_m for rim in rims])
-    points_px = np.array([rim.pixel_px for rim in rims])
+    points_m, points_px = _places(rims)
     noise = np.array([rim.covariance_px for rim in rims]) + lens_rms_px**2 * np.eye(2)
     built = np.array([rim.built_covariance_px for rim in rims])
     found = pose_from_points(points_m, points_px, block_diag(*(noise + built)), intrinsics)
-    freedom = 2 * len(rims) - 6
-    if chdtrc(freedom, found.chi_square) < WRONG_FIT_P:
-        raise WrongMark(
-            f"the rims of {len(rims)} objects were seen, but not where the panel file has them"
-            f" (chi-square {found.chi_square:.0f} on {freedom} degrees of freedom)",
-            hint="measure position_m of the objects again, and check the lens calibration",
-            chi_square=round(found.chi_square, 1),
-        )
-    return PanelSighting(
-        way=PanelWay.LOOKS,
-        camera_from_panel=allowed_pose(found.poses, prior, ambiguous=found.ambiguous, by="objects"),
-        names=tuple(rim.name for rim in rims),
-        points_m=points_m,
-        points_px=points_px,
-        covariance_px=noise,
-        built_covariance_px=built,
-        chi_square=found.chi_square,
-        degrees_of_freedom=freedom,
-        ambiguous=found.ambiguous,
-        alternatives=len(found.poses) - 1,
-    )
+    check_fit(
+        found, len(rims), f"the rims of {len(rims)} objects were seen, but not where the panel file has them",
+        hint="measure position_m of the objects again, and check the lens calibration",
+    )  # fmt: skip
+    names = tuple(rim.name for rim in rims)
+    return sighting(PanelWay.LOOKS, names, points_m, points_px, (noise, built), found, prior)
 
 
 def _recognised(
@@ -158,7 +141,11 @@ def _rims(gray: Image, panel: Panel, intrinsics: CameraIntrinsics, rough: Uncert
                 f"the rims of only {len(rims)} objects of panel {panel.name!r} are visible, and a pose needs {LEAST_RIMS}",
                 hint="uncover the panel and light it evenly, or put tags on it",
             )
-        points_m, points_px = (np.array([getattr(rim, key) for rim in rims]) for key in ("point_m", "pixel_px"))
         covariance = block_diag(*(rim.covariance_px + rim.built_covariance_px for rim in rims))
-        pose = pose_from_points(points_m, points_px, covariance, intrinsics).poses[0]
+        pose = pose_from_points(*_places(rims), covariance, intrinsics).poses[0]
     return rims
+
+
+def _places(rims: Sequence[RimView]) -> tuple[Array, Array]:
+    """Return the rims' points (N, 3) in the panel frame, and (N, 2) in the image."""
+    return np.array([rim.point_m for rim in rims]), np.array([rim.pixel_px for rim in rims])

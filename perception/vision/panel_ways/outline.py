@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.special import chdtrc
 
 from hal.arrays import Array
 from hal.calibration import CameraIntrinsics
@@ -17,10 +16,10 @@ from hal.geometry import UncertainPose
 from hal.panel import Panel
 from perception.vision.finding.framing import check_upright, one_plate
 from perception.vision.image import as_gray
-from perception.vision.lights.panel_finder import MODEL_SIGMA_PX, WRONG_FIT_P, PanelPrior, allowed_pose
+from perception.vision.lights.panel_finder import MODEL_SIGMA_PX, PanelPrior
 from perception.vision.panel_ways.corners import MeasuredCorners, measure_corners
 from perception.vision.panel_ways.points import pose_from_points
-from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, WrongMark
+from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, check_fit, sighting
 from perception.vision.projection import CameraProjection
 from perception.vision.registration.register import EdgeImage, edge_image
 
@@ -28,7 +27,7 @@ FOUND_SIGMA_PX = 3.0  # of a corner as the search for the plate gives it, which 
 WINDOWS_PX = (6.0, 3.0, 2.0)  # half lengths of the search for the sides
 EDGE_BIAS_PX = 0.12  # offset of a whole side: shade of the edge, blur, and the background's own brightness
 WALL_SHARE = 0.3  # share of the visible width of the plate's narrow side by which its edge may be displaced
-SIDES = ("upper", "right", "lower", "left")
+CORNERS = ("upper_left_corner", "upper_right_corner", "lower_right_corner", "lower_left_corner")
 
 
 def find_by_outline(
@@ -63,28 +62,13 @@ def find_by_outline(
     back = np.linalg.inv(measured.edge_normals_px)
     built = (panel.tolerances.edge_m * pixel_m) ** 2 * back @ back.transpose(0, 2, 1)
     found = pose_from_points(corners_m, measured.points_px, block_diag(*(noise + built)), intrinsics)
-    if chdtrc(2, found.chi_square) < WRONG_FIT_P:
-        raise WrongMark(
-            f"the outline does not fit a plate of {panel.width_m:g} x {panel.height_m:g} m"
-            f" (chi-square {found.chi_square:.0f} on 2 degrees of freedom)",
-            hint="measure width_m and height_m of the plate again, or state tolerances.edge_m; check the lens calibration",
-            chi_square=round(found.chi_square, 1),
-        )
-    pose = allowed_pose(found.poses, prior, ambiguous=found.ambiguous, by="outline")
-    check_upright(gray, CameraProjection(intrinsics=intrinsics, camera_from_panel=pose), panel)
-    return PanelSighting(
-        way=PanelWay.OUTLINE,
-        camera_from_panel=pose,
-        names=("upper_left_corner", "upper_right_corner", "lower_right_corner", "lower_left_corner"),
-        points_m=corners_m,
-        points_px=measured.points_px,
-        covariance_px=noise,
-        built_covariance_px=built,
-        chi_square=found.chi_square,
-        degrees_of_freedom=2,
-        ambiguous=found.ambiguous,
-        alternatives=len(found.poses) - 1,
-    )
+    check_fit(
+        found, 4, f"the outline does not fit a plate of {panel.width_m:g} x {panel.height_m:g} m",
+        hint="measure width_m and height_m of the plate again, or state tolerances.edge_m; check the lens calibration",
+    )  # fmt: skip
+    seen = sighting(PanelWay.OUTLINE, CORNERS, corners_m, measured.points_px, (noise, built), found, prior)
+    check_upright(gray, CameraProjection(intrinsics=intrinsics, camera_from_panel=seen.camera_from_panel), panel)
+    return seen
 
 
 def plate_corners_m(panel: Panel) -> Array:

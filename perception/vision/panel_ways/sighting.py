@@ -11,6 +11,8 @@ from scipy.special import chdtrc
 from hal.arrays import Array
 from hal.errors import PerceptionError
 from hal.geometry import UncertainPose, difference
+from perception.vision.lights.panel_finder import WRONG_FIT_P, PanelPrior, allowed_pose
+from perception.vision.panel_ways.points import PointsPose
 
 DISAGREE_P = 1e-4  # two ways whose poses differ by less probable errors than this contradict each other
 
@@ -55,6 +57,38 @@ class PanelSighting:
     degrees_of_freedom: int
     ambiguous: bool
     alternatives: int
+
+
+def fits(found: PointsPose, points: int) -> bool:
+    """Return whether a worse fit of so many points is not too improbable."""
+    return bool(chdtrc(2 * points - 6, found.chi_square) >= WRONG_FIT_P)
+
+
+def check_fit(found: PointsPose, points: int, what: str, *, hint: str) -> None:
+    """Raise `WrongMark`, which says `what` does not fit and what helps, if the pose of so many points fits too badly."""
+    if not fits(found, points):
+        raise WrongMark(
+            f"{what} (chi-square {found.chi_square:.0f} on {2 * points - 6} degrees of freedom)",
+            hint=hint, chi_square=round(found.chi_square, 1),
+        )  # fmt: skip
+
+
+def sighting(
+    way: PanelWay, names: tuple[str, ...], points_m: Array, points_px: Array, covariances_px: tuple[Array, Array],
+    found: PointsPose, prior: PanelPrior,
+) -> PanelSighting:  # fmt: skip
+    """Return the panel as found by points; `covariances_px` are `covariance_px` and `built_covariance_px`.
+
+    Raises:
+        NotFound, Ambiguous: see `allowed_pose`.
+    """
+    by = "objects" if way is PanelWay.LOOKS else way.value
+    return PanelSighting(
+        way=way, camera_from_panel=allowed_pose(found.poses, prior, ambiguous=found.ambiguous, by=by), names=names,
+        points_m=points_m, points_px=points_px, covariance_px=covariances_px[0], built_covariance_px=covariances_px[1],
+        chi_square=found.chi_square, degrees_of_freedom=2 * len(points_m) - 6, ambiguous=found.ambiguous,
+        alternatives=len(found.poses) - 1,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

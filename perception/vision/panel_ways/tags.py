@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.special import chdtrc
 
 from hal.arrays import Array, Image
 from hal.calibration import CameraIntrinsics
@@ -17,10 +16,10 @@ from hal.camera_model import check_size
 from hal.errors import Ambiguous, NotFound
 from hal.panel import Panel, Tag
 from perception.vision.image import as_gray
-from perception.vision.lights.panel_finder import MODEL_SIGMA_PX, WRONG_FIT_P, PanelPrior, allowed_pose
+from perception.vision.lights.panel_finder import MODEL_SIGMA_PX, PanelPrior
 from perception.vision.panel_ways.corners import measure_corners
 from perception.vision.panel_ways.points import PointsPose, pose_from_points
-from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, WrongMark
+from perception.vision.panel_ways.sighting import PanelSighting, PanelWay, check_fit, fits, sighting
 from perception.vision.projection import CameraProjection
 from perception.vision.registration.register import edge_image
 
@@ -50,32 +49,28 @@ def find_by_tags(
     check_size(gray, intrinsics)
     seen = _visible(gray, panel.tags)
     if not seen:
-        names = ", ".join(f"{tag.family} id {tag.id}" for tag in panel.tags) or "the panel file has none"
+        known = ", ".join(f"{tag.family} id {tag.id}" for tag in panel.tags) or "the panel file has none"
         raise NotFound(
-            f"no tag of panel {panel.name!r} is visible ({names})",
+            f"no tag of panel {panel.name!r} is visible ({known})",
             hint="uncover the tags, come nearer (3 px per cell of the code are needed), and check family and id",
         )
+    tags = list(seen)
     corners_px, noise = _measured(gray, seen, intrinsics)
-    found = _fit(seen, corners_px, noise, intrinsics, panel, lens_rms_px, prior)
-    _check_places(found, seen, corners_px, noise, intrinsics, panel, lens_rms_px, prior)
-    pose = allowed_pose(found.poses, prior, ambiguous=found.ambiguous, by="tags")
-    lens = noise + lens_rms_px**2 * np.eye(2)
-    pixel_m = intrinsics.fx_px / max(float(pose.parent_from_child.translation[2]), 0.05)
-    count = 4 * len(seen)
+    noise += lens_rms_px**2 * np.eye(2)
+    found = _fit(tags, corners_px, noise, panel, intrinsics)
+    what = f"{len(tags)} tags were seen, but not where the panel file has them"
+    if len(tags) > 2 and not fits(found, 4 * len(tags)):
+        what += f"; without {_worst(tags, corners_px, noise, panel, intrinsics).name} the others fit best"
+    check_fit(
+        found, 4 * len(tags), what,
+        hint="measure place, size_m and angle_rad of the tags again (black square only), and check the lens calibration",
+    )  # fmt: skip
+    names = tuple(f"{tag.name}_corner_{k}" for tag in tags for k in range(4))
+    pixel_m = intrinsics.fx_px / max(float(found.poses[0].parent_from_child.translation[2]), 0.05)
     place_px = 2.0 * panel.tolerances.tag_m * pixel_m  # twice, because the error is common to the tag's four corners
-    return PanelSighting(
-        way=PanelWay.TAGS,
-        camera_from_panel=pose,
-        names=tuple(f"{tag.name}_corner_{k}" for tag in seen for k in range(4)),
-        points_m=_corners_m(seen),
-        points_px=corners_px.reshape(-1, 2),
-        covariance_px=lens.reshape(count, 2, 2),
-        built_covariance_px=np.tile(place_px**2 * np.eye(2), (count, 1, 1)),
-        chi_square=found.chi_square,
-        degrees_of_freedom=2 * count - 6,
-        ambiguous=found.ambiguous,
-        alternatives=len(found.poses) - 1,
-    )
+    built = np.tile(place_px**2 * np.eye(2), (len(names), 1, 1))
+    seen_px, noise = corners_px.reshape(-1, 2), noise.reshape(-1, 2, 2)
+    return sighting(PanelWay.TAGS, names, _corners_m(tags), seen_px, (noise, built), found, prior)
 
 
 def _visible(gray: Image, tags: Sequence[Tag]) -> dict[Tag, Array]:
@@ -103,7 +98,7 @@ def _visible(gray: Image, tags: Sequence[Tag]) -> dict[Tag, Array]:
     return seen
 
 
-def _corners_m(tags: Sequence[Tag] | dict[Tag, Array]) -> Array:
+def _corners_m(tags: Sequence[Tag]) -> Array:
     return np.array([corner for tag in tags for corner in tag.corners_m])
 
 
@@ -131,57 +126,26 @@ def _measured(gray: Image, seen: dict[Tag, Array], intrinsics: CameraIntrinsics)
 
 
 def _fit(
-    seen: dict[Tag, Array],
-    corners_px: Array,
-    noise: Array,
-    intrinsics: CameraIntrinsics,
-    panel: Panel,
-    lens_rms_px: float,
-    prior: PanelPrior,
+    tags: Sequence[Tag], corners_px: Array, noise: Array, panel: Panel, intrinsics: CameraIntrinsics
 ) -> PointsPose:
-    """Return the pose by all corners; an error of a tag's place is common to its four corners."""
-    rough = prior.camera_from_panel.translation[2]
-    if len(seen) > 0:  # the distance by the tags themselves
-        spread_m = np.linalg.norm(np.ptp(_corners_m(seen), axis=0))
-        spread_px = np.linalg.norm(np.ptp(corners_px.reshape(-1, 2), axis=0))
-        rough = intrinsics.fx_px * spread_m / max(float(spread_px), 1.0)
-    place_px = panel.tolerances.tag_m * intrinsics.fx_px / max(float(rough), 0.05)
-    turn_px = np.array([tag.size_m for tag in seen])  # a tag is turned by up to its place error over its side
+    """Return the pose by all corners (T, 4, 2) px; an error of a tag's place is common to its four corners."""
+    corners_m = _corners_m(tags)
+    spread_m = np.linalg.norm(np.ptp(corners_m, axis=0))
+    spread_px = np.linalg.norm(np.ptp(corners_px.reshape(-1, 2), axis=0))
+    distance_m = intrinsics.fx_px * spread_m / max(float(spread_px), 1.0)
+    place_px = panel.tolerances.tag_m * intrinsics.fx_px / max(float(distance_m), 0.05)
+    shift = np.tile(np.eye(2), (4, 1))
     blocks = []
-    for k in range(len(seen)):
-        lens = block_diag(*(noise[k] + lens_rms_px**2 * np.eye(2)))
-        shift = np.tile(np.eye(2), (4, 1))
-        from_middle = corners_px[k] - corners_px[k].mean(axis=0)
-        turn = np.column_stack([-from_middle[:, 1], from_middle[:, 0]]).reshape(8, 1)
-        turn_sigma = 0.5 * panel.tolerances.tag_m / turn_px[k]
-        blocks.append(lens + place_px**2 * shift @ shift.T + turn_sigma**2 * turn @ turn.T)
-    return pose_from_points(_corners_m(seen), corners_px.reshape(-1, 2), block_diag(*blocks), intrinsics)
+    for tag, places, own in zip(tags, corners_px, noise, strict=True):
+        u, v = (places - places.mean(axis=0)).T
+        turn = np.column_stack([-v, u]).reshape(8, 1)
+        turn_sigma = 0.5 * panel.tolerances.tag_m / tag.size_m  # a tag is turned by up to its place error over its side
+        blocks.append(block_diag(*own) + place_px**2 * shift @ shift.T + turn_sigma**2 * turn @ turn.T)
+    return pose_from_points(corners_m, corners_px.reshape(-1, 2), block_diag(*blocks), intrinsics)
 
 
-def _check_places(
-    found: PointsPose,
-    seen: dict[Tag, Array],
-    corners_px: Array,
-    noise: Array,
-    intrinsics: CameraIntrinsics,
-    panel: Panel,
-    lens_rms_px: float,
-    prior: PanelPrior,
-) -> None:
-    """Raise `WrongMark` if the fit is too bad for the stated errors."""
-    if chdtrc(8 * len(seen) - 6, found.chi_square) >= WRONG_FIT_P:
-        return
-    culprit = ""
-    if len(seen) > 2:
-        rest = []
-        for k in range(len(seen)):
-            others = {tag: place for j, (tag, place) in enumerate(seen.items()) if j != k}
-            keep = [j for j in range(len(seen)) if j != k]
-            rest.append(_fit(others, corners_px[keep], noise[keep], intrinsics, panel, lens_rms_px, prior).chi_square)
-        culprit = f"; without {list(seen)[int(np.argmin(rest))].name} the others fit best"
-    raise WrongMark(
-        f"{len(seen)} tags were seen, but not where the panel file has them (chi-square {found.chi_square:.0f} on"
-        f" {8 * len(seen) - 6} degrees of freedom){culprit}",
-        hint="measure place, size_m and angle_rad of the tags again (black square only), and check the lens calibration",
-        chi_square=round(found.chi_square, 1),
-    )
+def _worst(tags: Sequence[Tag], corners_px: Array, noise: Array, panel: Panel, intrinsics: CameraIntrinsics) -> Tag:
+    """Return the tag without which the others fit best."""
+    others = [[j for j in range(len(tags)) if j != k] for k in range(len(tags))]
+    rest = [_fit([tags[j] for j in some], corners_px[some], noise[some], panel, intrinsics) for some in others]
+    return tags[int(np.argmin([found.chi_square for found in rest]))]

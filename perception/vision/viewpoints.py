@@ -31,6 +31,7 @@ SIDE_M = (0.34, 0.38, CLOSE_UP_M)  # farther away than a close-up, because an oc
 NEAR_M = 0.25  # at such a tilt the fingers extend 10 cm beyond the camera
 NEAR_SIDES = {"close by below": (0.45, 0.0), "close by the right": (0.0, 0.2)}  # tilts, rad
 CLOSE_SIDES = (*NEAR_SIDES, "the right")  # for two states that look alike from farther away
+ROLLS = (0.0, math.pi / 2, -math.pi / 2, math.pi)
 TINY_M = 1e-12  # of a direction, so that a line along a face divides by no zero
 REACH_M = 0.045  # half size of the area around an object that a close-up must show
 
@@ -93,31 +94,21 @@ def close_up_poses(
     """Yield camera poses for reading the objects around a panel point from about a distance, best first."""
     for stretch in CLOSE_UP_STRETCHES:
         for tilt in ((0.0, 0.0), (0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12), (0.22, 0.0), (-0.22, 0.0)):
-            for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
+            for roll in ROLLS:
                 yield facing(base_from_panel, point_m, stretch * distance_m, roll_rad=roll, tilt_rad=tilt)
 
 
-def side_poses(
-    base_from_panel: RigidTransform, point_m: Sequence[float], turns: tuple[float, float]
-) -> Iterator[RigidTransform]:
-    """Yield camera poses that look at a panel point from one of the `SIDES`, past an occluder in front of it.
-
-    At a tilt the fingers come nearer to the occluder. `turns`: the value in `SIDES`.
-    """
-    for distance_m in SIDE_M:
-        for lean_rad in SIDE_RAD:
-            for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
-                tilt = (lean_rad * turns[0], lean_rad * turns[1])
-                yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
-
-
 def poses_from(base_from_panel: RigidTransform, point_m: Sequence[float], side: str) -> Iterator[RigidTransform]:
-    """Yield camera poses from one of the `SIDES` or `NEAR_SIDES`, best first."""
-    if side in SIDES:
-        yield from side_poses(base_from_panel, point_m, SIDES[side])
-        return
-    for roll in (0.0, math.pi / 2, -math.pi / 2, math.pi):
-        yield facing(base_from_panel, point_m, NEAR_M, roll_rad=roll, tilt_rad=NEAR_SIDES[side])
+    """Yield camera poses from one of the `SIDES` or `NEAR_SIDES`, best first, to look at a panel point past an occluder.
+
+    At a tilt the fingers come nearer to the occluder.
+    """
+    stands = [(NEAR_M, NEAR_SIDES[side])] if side in NEAR_SIDES else [
+        (distance_m, (lean_rad * SIDES[side][0], lean_rad * SIDES[side][1])) for distance_m in SIDE_M for lean_rad in SIDE_RAD
+    ]  # fmt: skip
+    for distance_m, tilt in stands:
+        for roll in ROLLS:
+            yield facing(base_from_panel, point_m, distance_m, roll_rad=roll, tilt_rad=tilt)
 
 
 def sides_by_sight(points_m: Array, boxes: Sequence[Box]) -> list[str]:

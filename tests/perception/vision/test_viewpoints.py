@@ -23,8 +23,8 @@ from perception.vision.viewpoints import (
     hidden_share,
     overview_distance_m,
     overview_poses,
+    poses_from,
     reading_distance_m,
-    side_poses,
     sides_by_sight,
 )
 
@@ -62,7 +62,7 @@ def test_an_upright_view_shows_the_panel_upright() -> None:
     ("side", "axis", "sign"), [("the right", 0, 1), ("the left", 0, -1), ("above", 1, 1), ("below", 1, -1)]
 )
 def test_a_look_from_a_side_stands_on_that_side(side: str, axis: int, sign: int) -> None:
-    for camera in side_poses(BASE_FROM_PANEL, (0.1, 0.05, 0.0), SIDES[side]):
+    for camera in poses_from(BASE_FROM_PANEL, (0.1, 0.05, 0.0), side):
         stands = (BASE_FROM_PANEL.inv() * camera).translation - (0.1, 0.05, 0.0)
         assert sign * stands[axis] > 0.08
         assert abs(stands[1 - axis]) < 1e-9

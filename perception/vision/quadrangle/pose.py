@@ -86,9 +86,12 @@ class QuadranglePose:
         return transform(self.rotation, self.translation_m)
 
     @property
-    def uncertain(self) -> UncertainPose:
-        """The maximum-likelihood pose with its covariance, for the arithmetic of `hal.geometry`."""
-        return UncertainPose(parent_from_child=self.camera_from_object, covariance=self.covariance)
+    def poses(self) -> list[UncertainPose]:
+        """The maximum-likelihood pose, then the other minima, most likely first, for the arithmetic of `hal.geometry`."""
+        return [
+            UncertainPose(parent_from_child=one.camera_from_object, covariance=one.covariance)
+            for one in (self, *self.alternatives) if one.covariance is not None
+        ]  # fmt: skip
 
     @property
     def p_value(self) -> float:

@@ -9,8 +9,9 @@ import numpy as np
 
 from hal.arrays import Array
 from hal.jit import compiled, inlined
+from hal.least_squares import solve_damped
 from hal.small_algebra import put1
-from perception.vision.quadrangle.cost import chi_square, expand, newton_step, rotation_of, turn_onto
+from perception.vision.quadrangle.cost import LEAST_PIVOT, chi_square, expand, rotation_of, turn_onto
 from perception.vision.quadrangle.small_vectors import back3, cross3, dot3, mix3, product3, times3, unit3
 
 MIRROR_TURN_COS = 0.99619469809  # 5 degrees: poses whose normals are nearer than this count as one
@@ -30,18 +31,17 @@ def profile(
     n = times3(R, normal)
     if dot3(n, direction) > -0.99:
         R = product3(turn_onto(n, direction), R)
-    g, N, H = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    g4, x4, H4, N4, L4 = np.empty(4), np.empty(4), np.empty((4, 4)), np.empty((4, 4)), np.zeros((4, 4))
-    cost = expand(R, t, X, m, A, g, N, H)
+    g, N = np.empty(6), np.empty((6, 6))
+    x4, N4, L4 = np.empty(4), np.empty((4, 4)), np.zeros((4, 4))
+    cost = expand(R, t, X, m, A, g, N)
     for _ in range(12):
         if not np.isfinite(cost):
             break
         _contract(N, direction, N4)
-        _contract(H, direction, H4)
         for i in range(3):
-            g4[i] = g[i]
-        g4[3] = g[3] * direction[0] + g[4] * direction[1] + g[5] * direction[2]
-        if newton_step(H4, N4, 0.0, 1e-6, g4, x4, L4) < 0.0:
+            x4[i] = -g[i]
+        x4[3] = -g[3] * direction[0] - g[4] * direction[1] - g[5] * direction[2]
+        if solve_damped(N4, N4, 1e-6, 0.0, LEAST_PIVOT, x4, L4, 4) < 0.0:
             break
         step = 1.0
         improved = False
@@ -60,7 +60,7 @@ def profile(
         cost = new
         if fall < 1e-3:
             break
-        cost = expand(R, t, X, m, A, g, N, H)
+        cost = expand(R, t, X, m, A, g, N)
     log_det = 0.0
     for i in range(4):
         log_det += 2.0 * np.log(L4[i, i])

@@ -46,21 +46,26 @@ def test_the_cubic_root_is_the_largest_real_one(b: float, c: float, d: float) ->
     assert min(abs(root - r) for r in real) < 1e-4 * (1 + abs(root))
 
 
-def test_gradient_and_hessian_agree_with_finite_differences() -> None:
+def test_gradient_and_information_agree_with_finite_differences() -> None:
     rng = np.random.default_rng(0)
-    for _ in range(5):
+    for is_exact in (False, True, False, True):
         X, m = 0.1 * rng.normal(size=(4, 3)), 0.1 * rng.normal(size=(4, 2))
         A = np.tile([3e3, 5e2, 2e3], (4, 1))
         R, t = rotation_of(rng.normal(size=3)), np.array([0.1, 0.05, 1.0])
-        g, N, H = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-        cost = expand(R, t, X, m, A, g, N, H)
+        if is_exact:  # where residuals vanish, the Gauss-Newton matrix is half the Hessian
+            seen = X @ R.T + t
+            m = seen[:, :2] / seen[:, 2:]
+        g, N = np.empty(6), np.empty((6, 6))
+        cost = expand(R, t, X, m, A, g, N)
 
         def at(x: np.ndarray, R: np.ndarray = R, t: np.ndarray = t, rest: tuple = (X, m, A)) -> float:
             return float(chi_square(rotation_of(x[3:]) @ R, t + x[:3], *rest))
 
         e = 1e-4 * np.eye(6)
         assert cost == pytest.approx(at(np.zeros(6)))
-        numeric_g = np.array([at(a) - at(-a) for a in e]) / 4e-4
-        numeric_h = np.array([[at(a + b) - at(a - b) - at(b - a) + at(-a - b) for a in e] for b in e]) / 8e-8
-        np.testing.assert_allclose(g, numeric_g, atol=1e-5 * np.abs(g).max())
-        np.testing.assert_allclose(H, numeric_h, atol=1e-5 * np.abs(H).max())
+        if is_exact:
+            numeric = np.array([[at(a + b) - at(a - b) - at(b - a) + at(-a - b) for a in e] for b in e]) / 8e-8
+            np.testing.assert_allclose(N, numeric, atol=1e-5 * np.abs(N).max())
+        else:
+            numeric = np.array([at(a) - at(-a) for a in e]) / 4e-4
+            np.testing.assert_allclose(g, numeric, atol=1e-5 * np.abs(g).max())

@@ -8,7 +8,7 @@ three predict.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,16 +18,7 @@ from hal.calibration import CameraIntrinsics
 from hal.camera_model import undistort_pixels
 from hal.errors import Ambiguous, InvalidRequest, NotFound
 from perception.vision.lights.find import LightBlobs
-from perception.vision.lights.search import (
-    CONTRAST_SPREAD,
-    MISSING_INSIDE,
-    MISSING_OUTSIDE,
-    OUTSIDE_PER_WIDTH,
-    SIZE_SPREAD,
-    UNCHECKED,
-    insert,
-    search,
-)
+from perception.vision.lights.search import UNCHECKED, alike, insert, search, unseen
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])  # camera x right, y down, z forward; panel x right, y up, z towards the viewer
 CANDIDATES = 16  # blobs at most that are considered
@@ -194,30 +185,21 @@ def _pairs(centres: Array, traits: Array, model: Array, frame: Array, into: tupl
     """Add hypotheses with two lights only: a similarity of the plane (near-frontal view) predicts the other two."""
     reward, log_size, log_contrast, _ = traits
     flat = model[:, :2]
-    for a, b in permutations(range(4), 2):
-        if a > b:
-            continue
+    for a, b in combinations(range(4), 2):
         for i, j in permutations(range(len(centres)), 2):
             taught, image = complex(*(flat[b] - flat[a])), complex(*(centres[j] - centres[i]))
             if taught == 0:
                 continue
             ratio = image / taught
             roll = float(np.angle(ratio))
-            spread = 0.25 * (log_size[i] - log_size[j]) ** 2 / SIZE_SPREAD**2
-            spread += 0.25 * (log_contrast[i] - log_contrast[j]) ** 2 / CONTRAST_SPREAD**2
             order = np.full(4, -1, np.int64)
             order[a], order[b] = i, j
             others = [k for k in range(4) if k not in (a, b)]
             offsets = [ratio * complex(*(flat[k] - flat[a])) for k in others]
             places = [centres[i] + [o.real, o.imag] for o in offsets]
-            score = reward[i] + reward[j] - UNCHECKED - spread - 0.5 * (roll / (0.5 * ROLL_SIGMA_RAD)) ** 2
-            insert(float(score - sum(_missing(place, frame) for place in places)), order, *into)
-
-
-def _missing(place_px: Array, frame: Array) -> float:
-    """Return the score penalty for a light that is not visible at this position."""
-    beyond = float(np.maximum(np.maximum(-place_px, place_px - frame), 0.0).sum())
-    return MISSING_OUTSIDE + OUTSIDE_PER_WIDTH * beyond / float(frame[0]) if beyond > 0.0 else MISSING_INSIDE
+            score = reward[i] + reward[j] + UNCHECKED + alike(log_size[[i, j]], log_contrast[[i, j]], 2)
+            score += sum(unseen(u, v, frame) for u, v in places) - 0.5 * (roll / (0.5 * ROLL_SIGMA_RAD)) ** 2
+            insert(float(score), order, *into)
 
 
 def _accept(

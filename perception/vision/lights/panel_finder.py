@@ -116,7 +116,8 @@ def find_panel(
             hint="check the panel file's light positions, the lens calibration, and for reflections or another lamp",
             chi_square=round(pose.chi_square, 1),
         )
-    return FoundPanel(camera_from_panel=_plausible(pose, prior), lights=lights, covariance_px=covariance_px, pose=pose)
+    found = allowed_pose(pose.poses, prior, ambiguous=pose.ambiguous, by="four lights")
+    return FoundPanel(camera_from_panel=found, lights=lights, covariance_px=covariance_px, pose=pose)
 
 
 def find_panel_lights(
@@ -177,13 +178,3 @@ def allowed_pose(poses: Sequence[UncertainPose], prior: PanelPrior, *, ambiguous
             hint="look from another side: tilt the camera 15 degrees or come nearer",
         )
     return fitting[0]
-
-
-def _plausible(pose: QuadranglePose, prior: PanelPrior) -> UncertainPose:
-    """Return the pose of the lights that the prior allows."""
-    others = [
-        UncertainPose(parent_from_child=a.camera_from_object, covariance=a.covariance)
-        for a in pose.alternatives
-        if a.covariance is not None
-    ]
-    return allowed_pose([pose.uncertain, *others], prior, ambiguous=pose.ambiguous, by="four lights")

@@ -88,10 +88,11 @@ class QuadranglePose:
     @property
     def poses(self) -> list[UncertainPose]:
         """The maximum-likelihood pose, then the other minima, most likely first, for the arithmetic of `hal.geometry`."""
-        return [
-            UncertainPose(parent_from_child=one.camera_from_object, covariance=one.covariance)
-            for one in (self, *self.alternatives) if one.covariance is not None
-        ]  # fmt: skip
+        best = UncertainPose(parent_from_child=self.camera_from_object, covariance=self.covariance)
+        return [best, *(
+            UncertainPose(parent_from_child=other.camera_from_object, covariance=other.covariance)
+            for other in self.alternatives if other.covariance is not None
+        )]  # fmt: skip
 
     @property
     def p_value(self) -> float:

@@ -35,7 +35,6 @@ class ImageAlignment:
 
     Attributes:
         second_from_first: (2, 3) affine map of pixels (shift, rotation and growth).
-        gain, offset: gray levels, second = gain * first + offset.
         shift_px: (2,) motion of the image centre.
         warped: (H, W) the first image resampled to the second's view, in the second's gray levels.
         inside: (H, W) whether `warped` is known.
@@ -43,8 +42,6 @@ class ImageAlignment:
     """
 
     second_from_first: Array
-    gain: float
-    offset: float
     shift_px: tuple[float, float]
     warped: Image
     inside: NDArray[np.bool_]
@@ -124,10 +121,10 @@ def _result(first: Image, second: Image, edges: Edges | None, affine: Array) -> 
     agreement = 1.0
     if edges is not None:
         a, b = (np.concatenate([g[edges[:2]] for g in both]) for both in (gradients(warped), edges[2]))
-        agreement = _robust_correlation(a, b)
+        agreement = float((a @ b) / np.sqrt(max((a @ a) * (b @ b), 1e-12)))
     centre = affine @ [width / 2.0, height / 2.0, 1.0] - [width / 2.0, height / 2.0]
     return ImageAlignment(
-        second_from_first=affine, gain=float(gain), offset=float(offset), shift_px=(float(centre[0]), float(centre[1])),
+        second_from_first=affine, shift_px=(float(centre[0]), float(centre[1])),
         warped=warped, inside=inside, agreement=agreement,
     )  # fmt: skip
 
@@ -148,14 +145,6 @@ def _tones(first: NDArray[Any], second: NDArray[Any]) -> tuple[float, float]:
         return 1.0, float(np.median(change))
     slope, offset = np.polyfit(x, y, 1, w=np.sqrt(counts[common]))
     return 1.0 + float(slope), float(offset)
-
-
-def _robust_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Return the correlation without the tenth of the values that differ most, because lights and glare may change."""
-    rest = np.abs(a - b)
-    keep = rest <= np.quantile(rest, 0.9)
-    a, b = a[keep], b[keep]
-    return float((a @ b) / np.sqrt(max((a @ a) * (b @ b), 1e-12)))
 
 
 def gradients(image: Image) -> tuple[Image, Image]:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-LEVELS = np.linspace(0.25, 0.9, 9)  # tried levels, as shares of the brightest part
 RAMP = 0.5  # share of the step from glow to lamp over which pixels are counted in part
 RING_PX = 2  # half width of a lamp's edge, because of blur and sampling
 
@@ -32,18 +31,15 @@ class Core:
 
 
 def lamp_core(rise: Image, seed: Mask) -> Core | None:
-    """Return the part of a brighter region that has the steepest edge; None if there is none.
+    """Return the part of a brighter region above half of its peak; None if there is none.
 
-    The region above a level shrinks as the level rises; where it shrinks least per rise, there is an edge. Glow
-    decreases slowly, so its outlines have no edge. Near the edge, pixels count by how far they stand out of the glow.
+    Near the edge, pixels count by how far they stand out of the glow.
 
     Args:
         rise: (H, W) difference of on and off around one region.
         seed: (H, W) the region's pixels that stand out of the noise.
     """
-    peak = level_at(rise[seed], 0.99)
-    level = _steepest_level(rise, seed, peak)
-    body = _component(rise, seed, level)
+    body = _component(rise, seed, 0.5 * level_at(rise[seed], 0.99))
     if body is None:
         return None
     kernel = np.ones((3, 3), np.uint8)
@@ -57,23 +53,6 @@ def lamp_core(rise: Image, seed: Mask) -> Core | None:
     share = np.clip(0.5 + (rise - 0.5 * (top + glow)) / max(RAMP * (top - glow), 1e-3), 0.0, 1.0)
     weights = np.where(reach > 0, share, 0.0).astype(np.float32)
     return Core(weights=weights, top=top, glow=glow)
-
-
-def _steepest_level(rise: Image, seed: Mask, peak: float) -> float:
-    """Return the level, midway between two neighbouring ones, across which the region's mean radius changes least."""
-    radii = []
-    for share in LEVELS:
-        body = _component(rise, seed, share * peak)
-        radii.append(np.sqrt(float(body.sum()) / np.pi) if body is not None else 0.0)
-    shrink = -np.diff(radii)
-    alive = np.array(radii[1:]) > 1.0
-    if not alive.any():
-        return float(0.5 * peak)
-    # Neighbouring steps are averaged, because a single step of a small lamp's radius is dominated by sampling.
-    kernel = [0.5, 1.0, 0.5]
-    smooth = np.convolve(shrink, kernel, mode="same") / np.convolve(np.ones_like(shrink), kernel, mode="same")
-    best = int(np.argmin(np.where(alive, smooth, np.inf)))
-    return float(0.5 * (LEVELS[best] + LEVELS[best + 1]) * peak)
 
 
 def _component(rise: Image, seed: Mask, level: float) -> NDArray[np.uint8] | None:

@@ -1,7 +1,7 @@
 """Detection of lights in a pair of images, off and on (paper, Section II-B, Fig. 5): register, subtract, grow regions.
 
-The threshold comes from the noise of the pair itself: gray-level noise by brightness, and residuals of misregistered
-edges. Glare that has moved between the images is large and smooth, so a top-hat filter removes it.
+The threshold comes from the noise of the pair itself: gray-level noise, and residuals of misregistered edges. Glare
+that has moved between the images is large and smooth, so a top-hat filter removes it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from hal.arrays import Array
 from hal.errors import InvalidRequest
 from perception.vision.image import check_image
 from perception.vision.lights.alignment import ImageAlignment, gradients, register
-from perception.vision.lights.core import Core, lamp_core, level_at
+from perception.vision.lights.core import lamp_core, level_at
+from perception.vision.noise import noise_sigma
 
 Image = NDArray[np.float32]
 
@@ -79,7 +80,7 @@ def find_lights(
         raise InvalidRequest(
             f"image sizes differ: {off.shape[::-1]} off, {on.shape[::-1]} on", hint="take both with one camera setting"
         )
-    registration = register(off, on, noise=_raw_noise(off, on))
+    registration = register(off, on, noise=_raw_noise(image_off, image_on))
     diameter = largest_diameter_px if largest_diameter_px is not None else on.shape[0] / 12.0
     rise = _rise(on, registration, diameter)
     sigma = _noise(rise, registration)
@@ -97,19 +98,10 @@ def gray_of(image: NDArray[Any]) -> Image:
     return np.asarray(image if image.ndim == 2 else image[:, :, :3].mean(axis=2), np.float32)
 
 
-def _raw_noise(off: Image, on: Image) -> float:
-    """Return the noise of one pixel from second differences, which smooth shading and most edges do not affect."""
-    rough = [
-        np.median(
-            np.abs(
-                i[1::3, 2::3]
-                - 2.0 * i[1::3, 1:-1:3][:, : i[1::3, 2::3].shape[1]]
-                + i[1::3, :-2:3][:, : i[1::3, 2::3].shape[1]]
-            )
-        )
-        for i in (off, on)
-    ]
-    return max(1.4826 * float(np.mean(rough)) / float(np.sqrt(6.0)), 0.5)
+def _raw_noise(*images: NDArray[Any]) -> float:
+    """Return the noise of one pixel of two images."""
+    grays = [np.ascontiguousarray(gray_of(image), np.uint8) for image in images]
+    return max(float(np.mean([noise_sigma(gray) for gray in grays])), 0.5)
 
 
 def _rise(on: Image, registration: ImageAlignment, diameter: float) -> Image:
@@ -128,40 +120,21 @@ def _rise(on: Image, registration: ImageAlignment, diameter: float) -> Image:
 def _noise(rise: Image, registration: ImageAlignment) -> Image:
     """Return the standard deviation (H, W) of `rise` where nothing has changed.
 
-    sigma^2 = a + b I + c |grad I|^2: read noise, shot noise, and misregistered edges; each from quantiles of this pair.
+    sigma^2 = a + c |grad I|^2: noise, and misregistered edges; each from quantiles of this pair.
     """
-    base = registration.warped
-    gx, gy = gradients(base)
+    gx, gy = gradients(registration.warped)
     slope2 = np.asarray(gx * gx + gy * gy)
     sample = (slice(2, -2, 3), slice(2, -2, 3))
-    level, slope, change = base[sample], slope2[sample], rise[sample]
-    flat = slope <= np.median(slope)
-    a, b = _level_noise(level[flat], change[flat])
+    slope, change = slope2[sample], rise[sample]
+    flat = change[slope <= np.median(slope)]
+    a = max((1.4826 * float(np.median(np.abs(flat - np.median(flat))))) ** 2, 0.05)
     steep = slope >= max(float(np.quantile(slope, 0.95)), 1.0)
     c = 0.0
     if steep.sum() > 50:
-        excess = change[steep] ** 2 - (a + b * level[steep])
+        excess = change[steep] ** 2 - a
         # The lower quartile, 0.10 for chi-square with 1 degree, holds even if glare has moved over half of the edges.
         c = max(float(np.quantile(excess / slope[steep], 0.25)) / 0.2, 0.0)
-    variance = np.maximum(a + b * np.clip(base, 0.0, 255.0), 0.05) + max(c, 0.01) * slope2
-    return np.asarray(np.sqrt(variance), np.float32)
-
-
-def _level_noise(level: NDArray[Any], change: NDArray[Any]) -> tuple[float, float]:
-    """Return a, b of the variance a + b * level of the change, from median absolute deviations in bands of level."""
-    order = np.argsort(level)
-    bands = [part for part in np.array_split(order, 8) if len(part) >= 30]
-    overall = (1.4826 * float(np.median(np.abs(change - np.median(change))))) ** 2
-    if len(bands) < 3:
-        return max(overall, 0.05), 0.0
-    x = np.array([float(level[part].mean()) for part in bands])
-    y = np.array([(1.4826 * float(np.median(np.abs(change[part] - np.median(change[part]))))) ** 2 for part in bands])
-    if np.ptp(x) < 10.0:
-        return max(overall, 0.05), 0.0
-    i, j = np.triu_indices(len(x), 1)
-    # The slope by Theil and Sen is robust to bands with glare.
-    b = max(float(np.median((y[j] - y[i]) / np.maximum(x[j] - x[i], 1.0))), 0.0)
-    return max(float(np.median(y - b * x)), 0.05), b
+    return np.asarray(np.sqrt(a + max(c, 0.01) * slope2), np.float32)
 
 
 Blob = tuple[Array, Array, float, float, float, float, float]
@@ -239,27 +212,7 @@ def _measured(rise: Image, sigma: Image, seed: NDArray[np.bool_], corner: tuple[
     clear = min(sigmas / CLEAR_SIGMAS, 1.0) * min(sigmas * np.sqrt(area) / CLEAR_BLOB_SIGMAS, 1.0)
     round_ = min(aspect / 0.5, 1.0)
     full = float(np.exp(-0.5 * ((fill - 0.96) / 0.1) ** 2))
-    return centre, covariance, area, contrast, aspect, fill, clear * round_ * full * _edge_quality(rise, core)
-
-
-def _edge_quality(rise: Image, core: Core) -> float:
-    """Return 0 to 1, how sharp the edge of a region is, and how even the rise just outside.
-
-    The decrease from 3/4 to 1/4 of the top is 0.8 radii wide for a Gaussian bump, and less for a lamp. A lamp lights the
-    plate around it, by up to 0.55 of its own rise if the image saturates; glare has no plateau.
-    """
-    square = np.ones((3, 3), np.uint8)
-    reach = cv2.dilate((core.weights > 0.05).astype(np.uint8), square)
-    ring = (cv2.dilate(reach, square, iterations=3) > 0) & (reach == 0)
-    step = core.top - core.glow
-    outer, middle, inner = (
-        np.sqrt(float((rise[reach > 0] > core.glow + share * step).sum())) for share in (0.25, 0.5, 0.75)
-    )
-    rim = (outer - inner) / max(middle, 1.0)
-    uneven = level_at(np.abs(rise[ring] - core.glow), 0.5) / step if ring.any() else 0.0
-    sharp = float(np.exp(-0.5 * (max(rim - 0.4, 0.0) / 0.15) ** 2))
-    alone = float(np.exp(-0.5 * (max(uneven - 0.55, 0.0) / 0.15) ** 2))
-    return sharp * alone
+    return centre, covariance, area, contrast, aspect, fill, clear * round_ * full
 
 
 def _described(blobs: list[Blob], sigma: Image, registration: ImageAlignment) -> LightBlobs:

@@ -108,7 +108,7 @@ def answer(job: Job, folder: Path, *, least_confidence: float = ANSWER_AT) -> di
                 return blind_answer(job, image)
             case "dial":
                 status = read_dial(
-                    image, minimum=float(job["min"]), maximum=float(job["max"]), circular=bool(job["circular"]),
+                    image, (float(job["min"]), float(job["max"])), is_turn=bool(job["circular"]),
                     least_confidence=least_confidence,
                 )  # fmt: skip
                 return status_answer(status, "reading")

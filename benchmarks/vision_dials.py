@@ -169,7 +169,7 @@ def seen_aslant(canvas: Image, azimuth_rad: float, depth: float) -> Image:
 
 def error_of(dial: DrawnDial) -> tuple[float | None, float]:
     """Return the reader's error in % of the scale (None if it refuses) and its confidence."""
-    status = read_dial(dial.image, minimum=0.0, maximum=10.0, circular=dial.circular)
+    status = read_dial(dial.image, (0.0, 10.0), is_turn=dial.circular)
     if status.value is None:
         return None, status.confidence
     error = status.value - dial.reading

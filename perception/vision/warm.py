@@ -32,7 +32,7 @@ def warm_up() -> None:
     hidden[:, -6:] = True
     read_window(window, digits=3, decimals=1, dark=True, hidden=hidden)
     read_photographed_display(window, scene=True)
-    read_dial(upright_pointer(), minimum=0.0, maximum=1.0, circular=True)
+    read_dial(upright_pointer(), (0.0, 1.0), is_turn=True)
     _find_objects(window)
 
 

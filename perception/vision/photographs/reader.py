@@ -8,11 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.arrays import Image
 from hal.errors import InvalidRequest
 from perception.vision.image import check_image
 from perception.vision.photographs.anywhere import read_anything, read_face_anywhere
-from perception.vision.photographs.dial import MOVES, read_by_numerals, read_dial
+from perception.vision.photographs.dial import MOVES, read_dial
 from perception.vision.photographs.hands import Pointer
 from perception.vision.photographs.photo_display import read_photographed_display
 from perception.vision.reading import ANSWER_AT, PatchReading
@@ -56,7 +55,7 @@ def read_photograph(
     if kind == "display":
         return read_photographed_display(image, scene=is_scene, least_confidence=least_confidence)
     read = partial(
-        _read_face, is_turn=kind == "dial", scale=scale, ends_rad=ends_rad, pointer=pointer, least_confidence=least_confidence
+        read_dial, scale=scale, is_turn=kind == "dial", ends_rad=ends_rad, pointer=pointer, least_confidence=least_confidence
     )  # fmt: skip
     if kind is None and scale is None and pointer is None:
         return read_anything(image, read, least_confidence)
@@ -67,19 +66,6 @@ def read_photograph(
         return filling
     found = read_face_anywhere(image, read, is_scene=True)
     return found if found.answered else filling
-
-
-def _read_face(
-    image: Image, *, is_turn: bool, scale: tuple[float, float] | None, ends_rad: tuple[float, float] | None,
-    pointer: Pointer | None, least_confidence: float,
-) -> PatchReading:  # fmt: skip
-    """Read the dial that fills a picture, by its numerals if its scale is not told."""
-    if scale is None:
-        return read_by_numerals(image, pointer=pointer, least_confidence=least_confidence)
-    return read_dial(
-        image, minimum=scale[0], maximum=scale[1], circular=is_turn, ends_rad=ends_rad, pointer=pointer,
-        least_confidence=least_confidence,
-    )  # fmt: skip
 
 
 def _check(

@@ -38,7 +38,7 @@ def test_a_counterweight_does_not_turn_a_coloured_arrow_round(value: float) -> N
     cv2.line(image, tip, tail, (190, 40, 40), 5, cv2.LINE_AA)
     cv2.circle(image, tail, 8, (190, 40, 40), -1, cv2.LINE_AA)
     cv2.circle(image, (90, 90), 5, (40, 40, 40), -1, cv2.LINE_AA)
-    status = read_dial(image, minimum=0.0, maximum=10.0, circular=True)
+    status = read_dial(image, (0.0, 10.0), is_turn=True)
     assert status.value == pytest.approx(value, abs=0.1)
 
 
@@ -46,7 +46,7 @@ def test_a_dial_without_a_pointer_is_refused() -> None:
     image = np.full((160, 160, 3), (210, 215, 210), np.uint8)
     cv2.circle(image, (80, 80), 74, (40, 40, 40), 3, cv2.LINE_AA)
     cv2.circle(image, (110, 60), 9, (255, 255, 255), -1, cv2.LINE_AA)
-    status = read_dial(image, minimum=0.0, maximum=10.0, circular=True)
+    status = read_dial(image, (0.0, 10.0), is_turn=True)
     assert status.value is None
     assert status.reason
 
@@ -98,5 +98,5 @@ def test_a_drop_is_told_from_the_numerals_of_its_gray_that_touch_it(value: float
     cv2.circle(image, (110, 110), 38, 115, -1, cv2.LINE_AA)
     grain = cv2.GaussianBlur(np.random.default_rng(3).normal(0.0, 18.0, image.shape), (0, 0), 1.5)
     image = np.clip(cv2.GaussianBlur(image, (0, 0), 1.5) + grain, 0, 255).astype(np.uint8)
-    status = read_dial(image, minimum=0.0, maximum=10.0, circular=True)
+    status = read_dial(image, (0.0, 10.0), is_turn=True)
     assert status.value == pytest.approx(value, abs=0.2)

@@ -121,5 +121,5 @@ def test_a_coloured_pointer_is_read_from_its_own_shape(value: float) -> None:
     foot = np.array([80.0, 80.0])
     cv2.circle(image, (80, 80), 19, (150, 50, 50), -1, cv2.LINE_AA)
     cv2.fillPoly(image, [np.round([tip, foot + side, foot - side]).astype(np.int32)], (150, 50, 50), cv2.LINE_AA)
-    status = read_dial(image, minimum=0.0, maximum=10.0, circular=True)
+    status = read_dial(image, (0.0, 10.0), is_turn=True)
     assert status.value == pytest.approx(value, abs=0.1)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from hal.arrays import Array
+from hal.jit import compiled
 from perception.vision.status.digit_grid import AXES, DigitGrid
 from perception.vision.status.digit_grid_worth import Float32
 
@@ -21,18 +23,20 @@ MOST_TYPICAL = 0.37  # if gaps without a point exceed this, the stroke model is 
 MOST_ODDS = 6.0  # log odds at most: a brighter dot is not more certain, and two gaps with a dot each stay ambiguous
 HIDDEN_ODDS = -0.7  # log odds of a point in a hidden gap against no point at all
 STRIP = (0.55, 1.25)  # rows that are searched, in digit heights from the digit's top
-STROKES, BLURS = (0.09, 0.13), (0.02, 0.05, 0.09)  # candidate widths and blurs of a stroke, in digit heights
-INSET = 0.2  # share of a segment's axis by which its stroke is shorter at either end
+HALF_STROKES = np.array([0.045, 0.065])  # candidate half stroke widths, in digit heights; each is tried with every blur
+BLURS = np.array([0.02, 0.05, 0.09])
+INSETS = (0.2, 0.08, 0.32)  # shares of a segment's axis by which its stroke is shorter at either end
 PLACES_X = np.linspace(0.25, 0.75, 6)  # candidate places across the gap, as shares of it
 # Candidate places in a partly hidden gap: no stroke beside it confirms where the grid lies
 MORE_PLACES_X = np.linspace(0.25, 1.05, 9)
 PLACES_Y = np.linspace(-0.12, 0.06, 7)  # in digit heights, from the bottom segments' axis
-# Colons of 36 synthetic clocks have 1.1 or more, gaps of 75 certain numbers up to 0.6.
-COLON_STRIP, COLON_LEVEL = (0.0, 1.0), 0.8
+COLON_STRIP, COLON_LEVEL = (
+    (0.0, 1.0),
+    0.8,
+)  # colons of 36 synthetic clocks have 1.1 or more, gaps of 75 certain numbers up to 0.6
 COLON_Y = (np.linspace(-0.80, -0.58, 7), np.linspace(-0.42, -0.20, 7))
 LEAST_OF_DOT = 0.4  # visible share of a dot's template that is needed to estimate its height
-NOWHERE = -1e6  # height of a dot where too little of it is visible
-FINER = 4  # how much larger than the picture strokes are drawn
+STEPS = 8  # samples per px of the tabulated stroke profiles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,9 +84,14 @@ def find_colon(ink: Float32, seen: Float32, grid: DigitGrid, lit_levels: Array) 
 
 
 def dot_levels(
-    ink: Float32, seen: Float32, grid: DigitGrid, lit_levels: Array, *, strip: tuple[float, float] = STRIP,
+    ink: Float32,
+    seen: Float32,
+    grid: DigitGrid,
+    lit_levels: Array,
+    *,
+    strip: tuple[float, float] = STRIP,
     places_y: Array = PLACES_Y,
-) -> tuple[Array, NDArray[np.bool_]]:  # fmt: skip
+) -> tuple[Array, NDArray[np.bool_]]:
     """Return the level (cells - 1,) of the best dot in every gap, relative to lit segments beside it.
 
     Also returns whether each gap is visible.
@@ -96,14 +105,15 @@ def dot_levels(
     if last - first < 3:
         return np.zeros(grid.count - 1), np.zeros(grid.count - 1, bool)
     shown, clear = ink[first:last], seen[first:last]
-    drawn, sigma_px = _drawn(ink.shape, grid, lit_levels, shown, clear, slice(first, last))
-    heights = _heights((shown - drawn) * clear, clear, _dot(RADIUS * grid.height_px, sigma_px))
-    levels, visible = _best_dots(heights, clear, grid, first, PLACES_X, places_y)
+    drawn, sigma_px = _drawn(shown, clear, grid, lit_levels, first)
+    rest = (shown - drawn) * clear
+    dot = _dot(RADIUS * grid.height_px, sigma_px)
+    levels, visible = _best_dots(rest, clear, dot, grid.numbers, grid.count, first, PLACES_X, places_y)
     if not visible.all():
-        wide, _ = _best_dots(heights, clear, grid, first, MORE_PLACES_X, places_y)
-        levels = np.where(visible, levels, wide)
+        wide, _ = _best_dots(rest, clear, dot, grid.numbers, grid.count, first, MORE_PLACES_X, places_y)
+        levels = np.where(visible > 0, levels, wide)
     gain = float(np.percentile(drawn, 99.0)) / max(float(lit_levels.max()), 1e-6)
-    return levels / np.maximum(gain * _beside(lit_levels), 1e-6), visible
+    return levels / np.maximum(gain * _beside(lit_levels), 1e-6), visible > 0
 
 
 def _beside(lit_levels: Array) -> Array:
@@ -125,63 +135,118 @@ def _dot(radius_px: float, sigma_px: float) -> Float32:
     return np.asarray(cv2.GaussianBlur(disc, (0, 0), max(sigma_px, 0.3), borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
-def _drawn(
-    shape: tuple[int, ...], grid: DigitGrid, lit_levels: Array, shown: Float32, clear: Float32, rows: slice
-) -> tuple[Float32, float]:
-    """Draw the lit segments on some rows of a picture, with the stroke and the blur that fit the ink `shown` there best.
+def _drawn(strip: Float32, clear: Float32, grid: DigitGrid, lit_levels: Array, first: int) -> tuple[Float32, float]:
+    """Draw the lit segments with the stroke width and blur that minimise the residual.
 
-    Returns the drawing, scaled to fit where the ink is `clear`, and its blur in px.
+    Returns picture and blur in px.
     """
-    most, best = -1.0, (np.zeros_like(shown), 0.3)
-    for stroke in STROKES:
-        sharp = _strokes(shape, grid, lit_levels, stroke)
-        for blur in BLURS:
-            sigma_px = max(blur * grid.height_px, 0.3)
-            drawn = cv2.GaussianBlur(sharp, (0, 0), sigma_px)[rows] * clear
-            along, square = float((drawn * shown).sum()), max(float((drawn * drawn).sum()), 1e-6)
-            if along * along / square > most:
-                most, best = along * along / square, (drawn * (along / square), sigma_px)
-    return best
+    h = grid.height_px
+    shapes = [(half * h, max(blur * h, 0.3)) for half in HALF_STROKES for blur in BLURS]
+    distance = np.arange(0.0, (HALF_STROKES[-1] + 2.5 * BLURS[-1]) * h + 1.0, 1.0 / STEPS)
+    tables = np.stack([_profile(distance, half, blur) for half, blur in shapes], axis=1).astype(np.float32)
+    where = (first, *strip.shape), grid.numbers, np.ascontiguousarray(lit_levels, float), AXES
+    k, drawn, left = _closest(_strokes(*where, INSETS[0], tables), strip, clear)
+    for inset in INSETS[1:]:
+        _, other, other_left = _closest(_strokes(*where, inset, tables[:, k : k + 1].copy()), strip, clear)
+        if other_left < left:
+            drawn, left = other, other_left
+    return drawn, shapes[k][1]
 
 
-def _strokes(shape: tuple[int, ...], grid: DigitGrid, lit_levels: Array, stroke: float) -> Float32:
-    """Return a picture (H, W) of the lit segments, without blur."""
-    large = np.zeros((FINER * shape[0], FINER * shape[1]), np.float32)
-    thick = max(1, round(FINER * stroke * grid.height_px))
-    shares = np.array([[1.0 - INSET, INSET], [INSET, 1.0 - INSET]])
-    for cell, segment in zip(*np.nonzero(lit_levels), strict=True):
-        x, y = (shares @ AXES[segment]).T
-        places = np.column_stack(grid.place(x, y, np.full(2, cell)))
-        first, last = np.round(16 * (FINER * (places + 0.5) - 0.5)).astype(int).tolist()
-        cv2.line(large, first, last, float(lit_levels[cell, segment]), thick, cv2.LINE_8, 4)
-    return np.asarray(cv2.resize(large, shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
+def _closest(canvases: Float32, strip: Float32, clear: Float32) -> tuple[int, Float32, float]:
+    """Return the index of the picture (rows, columns, shapes) that fits the strip best.
+
+    Also returns that picture scaled to fit, and the residual.
+    """
+    seen = (canvases * clear[..., None]).reshape(strip.size, -1)
+    along = strip.ravel() @ seen
+    square = np.maximum(np.einsum("pk,pk->k", seen, seen), 1e-6)
+    k = int((along * along / square).argmax())
+    drawn = np.asarray(seen[:, k] * (along[k] / square[k]), np.float32).reshape(strip.shape)
+    return k, drawn, float((strip * strip * clear).sum() - along[k] * along[k] / square[k])
 
 
-def _heights(rest: Float32, clear: Float32, dot: Float32) -> Array:
-    """Return the least-squares height (H, W) of a dot on a constant background around every pixel."""
-
-    def around(image: Float32, kernel: Float32) -> Array:
-        return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_CONSTANT), float)
-
-    flat = np.ones_like(dot)
-    count = np.maximum(around(clear, flat), 1.0)
-    weight = around(clear, dot)
-    variance = around(clear, dot * dot) - weight**2 / count
-    height = (around(rest, dot) - weight * around(rest, flat) / count) / np.maximum(variance, 1e-6)
-    # A place that shows much less of the template's variance than a fully visible one cannot determine the height.
-    least = LEAST_OF_DOT * float((dot * dot).sum() - dot.sum() ** 2 / dot.size)
-    return np.where(variance > least, height, NOWHERE)
+def _profile(distance: Array, half_px: float, sigma_px: float) -> Array:
+    """Return the profile of a blurred stroke of unit height at distances from its axis."""
+    scale = np.sqrt(2.0) * sigma_px
+    return np.asarray(0.5 * (erf((half_px - distance) / scale) + erf((half_px + distance) / scale)))
 
 
+@compiled
+def _strokes(
+    strip: tuple[int, int, int], grid: Array, lit_levels: Array, axes: Array, inset: float, tables: Float32
+) -> Float32:
+    """Return the sum (rows, columns, shapes) of the lit segments' strokes on a strip that begins at row strip[0].
+
+    Args:
+        tables: (N, shapes) stroke profiles, sampled every 1 / STEPS px from the axis.
+    """
+    first, rows, columns = strip
+    left, pitch, width, top, bottom, slant = grid
+    height = bottom - top
+    shapes, reach = tables.shape[1], (tables.shape[0] - 1) / STEPS
+    canvases = np.zeros((rows, columns, shapes), np.float32)
+    ends = np.empty((2, 2))
+    for cell in range(lit_levels.shape[0]):
+        for k in range(7):
+            level = lit_levels[cell, k]
+            if level <= 0.0:
+                continue
+            for e in range(2):
+                share = inset if e == 0 else 1.0 - inset
+                x = axes[k, 0, 0] + share * (axes[k, 1, 0] - axes[k, 0, 0])
+                v = top + (axes[k, 0, 1] + share * (axes[k, 1, 1] - axes[k, 0, 1])) * height
+                ends[e, 0], ends[e, 1] = left + cell * pitch + x * width + slant * ((top + bottom) / 2 - v), v - first
+            along_u, along_v = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
+            length = along_u * along_u + along_v * along_v
+            for y in range(max(0, int(ends[:, 1].min() - reach)), min(rows, int(ends[:, 1].max() + reach) + 1)):
+                for x in range(max(0, int(ends[:, 0].min() - reach)), min(columns, int(ends[:, 0].max() + reach) + 1)):
+                    t = min(1.0, max(0.0, ((x - ends[0, 0]) * along_u + (y - ends[0, 1]) * along_v) / length))
+                    du, dv = x - ends[0, 0] - t * along_u, y - ends[0, 1] - t * along_v
+                    off = int(np.sqrt(du * du + dv * dv) * STEPS)
+                    if off < tables.shape[0]:
+                        for s in range(shapes):
+                            canvases[y, x, s] += level * tables[off, s]
+    return canvases
+
+
+@compiled
 def _best_dots(
-    heights: Array, clear: Float32, grid: DigitGrid, first: int, xs: Array, ys: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the height (cells - 1,) of the best dot at the places `xs` x `ys` in each gap, and which gaps are visible."""
-    gaps = np.arange(grid.count - 1.0)[:, None, None]
-    across = 1.0 + xs * (grid.pitch_px - grid.width_px) / grid.width_px
-    u, v = np.broadcast_arrays(*grid.place(across, 1.0 + ys[:, None], gaps))
-    i, j = np.rint(v).astype(int) - first, np.rint(u).astype(int)
-    inside = (i >= 0) & (i < heights.shape[0]) & (j >= 0) & (j < heights.shape[1])
-    i, j = i.clip(0, heights.shape[0] - 1), j.clip(0, heights.shape[1] - 1)
-    best = np.where(inside, heights[i, j], NOWHERE).max(axis=(1, 2))
-    return best, (inside & (clear[i, j] > 0.5)).mean(axis=(1, 2)) > 0.6
+    rest: Float32, seen: Float32, dot: Float32, grid: Array, count: int, first: int, xs: Array, ys: Array
+) -> tuple[Array, Array]:
+    """Return the least-squares height (count - 1,) of the best dot on a constant background in each gap.
+
+    Also returns 1 for each gap that is visible.
+    """
+    left, pitch, width, top, bottom, slant = grid
+    rows, columns = rest.shape
+    half = dot.shape[0] // 2
+    # Variance of a fully visible dot template: a place that shows much less of it cannot determine the dot's
+    # height.
+    least = LEAST_OF_DOT * ((dot * dot).sum() - dot.sum() ** 2 / dot.size)
+    best, clear = np.full(count - 1, -np.inf), np.zeros(count - 1)
+    for gap in range(count - 1):
+        visible = 0
+        for y in ys:
+            for x in xs:
+                v = bottom + y * (bottom - top)
+                u = left + gap * pitch + width + x * (pitch - width) + slant * ((top + bottom) / 2 - v)
+                i, j = round(v) - first, round(u)
+                product = total = weights = inks = n = 0.0
+                for a in range(max(0, i - half), min(rows, i + half + 1)):
+                    for b in range(max(0, j - half), min(columns, j + half + 1)):
+                        if seen[a, b] < 0.5:
+                            continue
+                        weight = dot[a - i + half, b - j + half]
+                        product += weight * rest[a, b]
+                        total += weight * weight
+                        weights += weight
+                        inks += rest[a, b]
+                        n += 1.0
+                if n > 1.0 and total - weights * weights / n > least:
+                    best[gap] = max(best[gap], (product - weights * inks / n) / (total - weights * weights / n))
+                if 0 <= i < rows and 0 <= j < columns and seen[i, j] > 0.5:
+                    visible += 1
+        if visible > 0.6 * len(xs) * len(ys):
+            clear[gap] = 1.0
+    return np.maximum(best, -1e6), clear

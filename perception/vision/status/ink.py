@@ -19,6 +19,7 @@ GLARE = 80.0  # range of the background in gray levels: more indicates glare, wh
 # Light per gray level as cameras encode it: under glare, strokes have less gray contrast but the same light
 # contrast.
 LIGHT = np.round(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)
+BORDER_ROUNDS = 4
 STROKE_SHOWS = 18.0  # gray levels
 NEAR_STROKE = 0.12  # share of the picture's height
 # Share of the picture's height from its border; least px there that no frame seen obliquely reaches
@@ -104,17 +105,22 @@ def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDAr
     Parts of the frame between the digits may hide them or include them, so they are returned as unknown.
 
     Args:
-        framed: whether a frame certainly surrounds the digits, so that anything touching the border is not a digit.
+        framed: whether a frame certainly surrounds the digits, so that anything touching the border is not a digit. It
+            is removed level by level, because a frame may have far more contrast than the digits.
 
     Returns:
         the remaining ink (H, W), and a mask of what may hide digits. The mask is None if nothing does, and if the
         removed ink is certainly a frame.
     """
-    found = _at_border(ink, 0.3 * level_at(ink, 0.985), framed)
-    if found is None:
-        return ink, None
-    gone, deep = found
-    return np.asarray(np.where(gone, 0.0, ink), np.float32), deep if not framed and deep.any() else None
+    lost: NDArray[np.bool_] | None = None
+    for _ in range(BORDER_ROUNDS if framed else 1):
+        found = _at_border(ink, 0.3 * level_at(ink, 0.985), framed)
+        if found is None:
+            break
+        gone, deep = found
+        ink = np.asarray(np.where(gone, 0.0, ink), np.float32)
+        lost = deep if not framed and deep.any() else None
+    return ink, lost
 
 
 def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:

@@ -32,9 +32,8 @@ MERGED = 1.7  # ratio of the widths of the two ends from which something beside 
 
 
 def lying_across(
-    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, dark_ink: bool | None = None,
-    through: bool = False,  # noqa: ARG001 - of sliders
-) -> NDArray[np.bool_] | None:  # fmt: skip
+    patch: Patch, *, half_width_m: float, half_height_m: float, is_round: bool, dark_ink: bool | None = None
+) -> NDArray[np.bool_] | None:
     """Return a mask (H, W) of the cables across an object in the patch; None if there are none.
 
     Args:

@@ -210,9 +210,7 @@ def _uncovered(patch: Patch, spec: Slider, s: Array, profile: Array, lean_m: flo
     lean_px = float(np.linalg.norm(patch.parallax_px_per_m)) * spec.cap_size_m[2]
     room_m = 0.004 + lean_px / patch.px_per_m
     width, height = spec.half_footprint_m
-    cover = lying_across(
-        patch, half_width_m=width + room_m, half_height_m=height + room_m, is_round=False, through=True
-    )
+    cover = lying_across(patch, half_width_m=width + room_m, half_height_m=height + room_m, is_round=False)
     if cover is None:
         return np.ones_like(s)
     open_ = _open(patch, cover, spec.angle_rad, s, 0.4 * spec.cap_size_m[1])

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Image
+from hal.jit import compiled
 from perception.vision.status.digit_grid_worth import Float32
 
 HEADROOM = 0.5  # share of a lit segment's level; with less room below white the pixel counts as unknown
@@ -106,7 +105,8 @@ def without_border(ink: Float32, *, framed: bool = False) -> tuple[Float32, NDAr
 
     Args:
         framed: whether a frame certainly surrounds the digits, so that anything touching the border is not a digit. It
-            is removed level by level, because a frame may have far more contrast than the digits.
+        is
+            removed level by level, because a frame may have far more contrast than the digits.
 
     Returns:
         the remaining ink (H, W), and a mask of what may hide digits. The mask is None if nothing does, and if the
@@ -150,11 +150,35 @@ def _at_border(ink: Float32, least: float, framed: bool) -> tuple[NDArray[np.boo
 
 def level_at(ink: Float32, share: float) -> float:
     """Return a quantile of the ink (0 to 255), to one gray level: the level that this share of it does not exceed."""
-    k = max(math.ceil(share * ink.size) - 1, 0)
-    return min(255.0, float(np.floor(np.partition(ink, k, axis=None)[k]))) if ink.size else 0.0
+    return _level_at(ink.ravel(), share)
 
 
+@compiled
+def _level_at(ink: Float32, share: float) -> float:
+    """Compute `level_at`."""
+    counts = np.zeros(256, np.int64)
+    for value in ink:
+        counts[min(255, int(value))] += 1
+    level, upto = 0, counts[0]
+    while upto < share * ink.size and level < 255:
+        level += 1
+        upto += counts[level]
+    return float(level)
+
+
+@compiled
 def column_levels(ink: Float32, share: float) -> Float32:
     """Return a quantile (W,) of every column of the ink (0 to 255): the level that this share of it does not exceed."""
-    k = len(ink) - math.ceil((1.0 - share) * len(ink))
-    return np.asarray(np.floor(np.partition(ink, k, axis=0)[k]), np.float32)
+    rows, columns = ink.shape
+    out = np.zeros(columns, np.float32)
+    counts = np.zeros(256, np.int64)
+    for x in range(columns):
+        counts[:] = 0
+        for y in range(rows):
+            counts[min(255, int(ink[y, x]))] += 1
+        level, above = 256, 0
+        while above < (1.0 - share) * rows and level > 0:
+            level -= 1
+            above += counts[level]
+        out[x] = level
+    return out

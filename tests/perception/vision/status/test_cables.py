@@ -78,6 +78,16 @@ def test_a_pointer_beside_a_cable_is_read(value: float, xs: tuple[int, int, int]
         assert status.answered
 
 
+@pytest.mark.parametrize("knee", [(85, 125), (95, 95), (100, 150)])
+@pytest.mark.parametrize("value", [1.0, 2.5, 4.0, 6.5, 8.0, 9.5])
+def test_a_thick_bent_cable_is_no_pointer(value: float, knee: tuple[int, int]) -> None:
+    picture = dark_face(value)
+    cv2.polylines(picture, [np.array([[-5, 60], knee, [100, SIZE + 5]])], False, 85, 36, cv2.LINE_8)
+    for face in (picture, 255 - picture):
+        status = read_gauge(patch_of(np.asarray(face, np.uint8)), GAUGE)
+        assert status.value is None or status.confidence < 0.8 or status.value == pytest.approx(value, abs=0.2)
+
+
 def test_a_pointer_of_an_uncertain_direction_is_refused() -> None:
     fit = PointerFit(
         angle_rad=0.3, sigma_rad=0.09, strength=40.0, contrast=90.0, rival_ratio=0.1, rival_rad=2.0, supported=1.0,

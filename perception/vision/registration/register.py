@@ -206,7 +206,8 @@ def _normal_equations(motion: Array, normals_px: Array, offset_px: Array, ok: ND
     weights = _weights(offset_px[ok], MEASUREMENT_SIGMA_PX)
     count = motion.shape[2]
     N, g = np.zeros((count, count)), np.zeros(count)
-    for weight, k in zip(weights, np.flatnonzero(ok)):  # noqa: B905 - numba knows no strict zip
+    for n, k in enumerate(np.flatnonzero(ok)):
+        weight = weights[n]
         along = motion[k, 0] * normals_px[k, 0] + motion[k, 1] * normals_px[k, 1]
         for i in range(count):
             g[i] += weight * along[i] * offset_px[k]

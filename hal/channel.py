@@ -10,13 +10,16 @@ import io
 import mmap
 import os
 import pickle
+import socket
+import struct
 from multiprocessing import reduction
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, answer_challenge, deliver_challenge
 from typing import Any
 
 from hal.clock import Clock, Deadline
 
 INLINE_BYTES = 16_384  # below this a pipe is as fast as shared memory
+SHORTEST_S = 0.001  # of a wait; 0 would be without end
 
 
 class _Pickler(pickle.Pickler):
@@ -47,6 +50,31 @@ class Channel:
         self._clock = clock
         self._outgoing: mmap.mmap | None = None
         self._incoming: mmap.mmap | None = None
+
+    @classmethod
+    def dial(cls, address: str, authkey: bytes, word: str, clock: Clock, *, timeout_s: float) -> tuple[Channel, Any]:
+        """Connect to a listener of `multiprocessing` on a Unix socket and say a word; returns the channel and the answer.
+
+        Raises:
+            BlockingIOError: a step took longer than `timeout_s`.
+            OSError: nothing listens there.
+            EOFError: the peer has ended.
+            multiprocessing.AuthenticationError: the keys differ.
+        """
+        with socket.socket(socket.AF_UNIX) as end:
+            _limit_waits(end, max(timeout_s, SHORTEST_S))
+            end.connect(address)
+            channel = cls(Connection(os.dup(end.fileno())), clock)
+            try:
+                answer_challenge(channel._connection, authkey)
+                deliver_challenge(channel._connection, authkey)
+                channel.send(word)
+                answer = channel.receive()
+            except BaseException:
+                channel.close()
+                raise
+            _limit_waits(end, 0.0)
+        return channel, answer
 
     def send(self, message: Any) -> None:
         """Send one message; the peer must have received the previous one (calls alternate)."""
@@ -113,3 +141,10 @@ class Channel:
         os.ftruncate(handle, size)
         self._outgoing = mmap.mmap(handle, size)
         return handle
+
+
+def _limit_waits(end: socket.socket, timeout_s: float) -> None:
+    """Let the kernel end each wait for this socket after a time, 0 for never; the socket stays blocking."""
+    seconds, fraction = divmod(timeout_s, 1.0)
+    for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
+        end.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(seconds), int(1e6 * fraction)))

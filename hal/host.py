@@ -14,7 +14,7 @@ import socket
 import tempfile
 import threading
 from collections.abc import Mapping
-from multiprocessing.connection import Client, Connection, Listener
+from multiprocessing.connection import Connection, Listener
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +126,10 @@ def _send(channel: Channel, answer: tuple[str, Any]) -> None:
 
 
 class Proxy:
-    """A proxy for an object of another process; threads may share it, and their calls queue."""
+    """A proxy for an object of another process; threads may share it, because each call has a connection to itself.
+
+    One connection stays open between calls, so that their number does not depend on the number of threads that call.
+    """
 
     def __init__(self, address: str, authkey: bytes, name: str, clock: Clock, *, gone_hint: str = SUPERVISED) -> None:
         self._gone_hint = gone_hint
@@ -135,8 +138,9 @@ class Proxy:
         self._name = name
         self._clock = clock
         self._lock = threading.Lock()
-        self._channel: Channel | None = None
-        self._methods, self._constants = self._open()
+        self._idle: Channel | None = None
+        channel, (self._methods, self._constants) = self._open(CONNECT_TIMEOUT_S)
+        self._keep(channel)
 
     def __getattr__(self, attribute: str) -> Any:
         if attribute.startswith("_"):
@@ -151,37 +155,41 @@ class Proxy:
         return sorted({*self._methods, *self._constants})  # a host serves these names to other processes
 
     def disconnect(self) -> None:
-        """Close this proxy's connection; the remote object stays open."""
-        with self._lock:
-            self._drop()
+        """Close the connection that waits for the next call; the remote object stays open."""
+        self._keep(None)
 
-    def _open(self) -> tuple[frozenset[str], dict[str, Any]]:
+    def _open(self, timeout_s: float) -> tuple[Channel, tuple[frozenset[str], dict[str, Any]]]:
+        """Return a new connection, and what its other end says of the object.
+
+        Raises:
+            DeviceTimeout: the process did not answer in time.
+            DeviceUnavailable: it has ended, or has no such object.
+        """
         try:
-            self._channel = Channel(Client(self._address, "AF_UNIX", authkey=self._authkey), self._clock)
-            self._channel.send(self._name)
-            described = self._channel.receive()
+            channel, described = Channel.dial(
+                self._address, self._authkey, self._name, self._clock, timeout_s=timeout_s
+            )
+        except BlockingIOError as error:
+            raise self._late("connect") from error
         except (OSError, EOFError, multiprocessing.AuthenticationError) as error:
-            self._drop()
             raise self._lost(error) from error
         if described is None:
-            self._drop()
+            channel.close()
             raise DeviceUnavailable(
                 f"the host has no object called {self._name!r}",
                 hint="check the names in the cell file",
                 device=self._name,
             )
-        methods, constants = described
-        return methods, constants
+        return channel, described
 
     def _call(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         given = kwargs.get("deadline")
         deadline = given if isinstance(given, Deadline) else None
-        if not self._lock.acquire(timeout=-1.0 if deadline is None else deadline.remaining_s() + ANSWER_MARGIN_S):
-            raise self._late(method, "it waited for an earlier call to the same device")
-        try:
-            outcome, value = self._exchange(method, args, kwargs, deadline)
-        finally:
-            self._lock.release()
+        channel = self._taken()
+        if channel is None:
+            channel, _ = self._open(CONNECT_TIMEOUT_S if deadline is None else deadline.remaining_s() + ANSWER_MARGIN_S)
+        outcome, value = self._exchange(channel, method, args, kwargs, deadline)
+        self._keep(channel)
         if outcome == "value":
             return value
         if outcome == "error":
@@ -189,34 +197,38 @@ class Proxy:
         raise RuntimeError(f"{self._name}.{method} failed in its own process: {value}")
 
     def _exchange(
-        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], deadline: Deadline | None
+        self, channel: Channel, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], deadline: Deadline | None
     ) -> tuple[str, Any]:
-        if self._channel is None:
-            self._open()
-        channel = self._channel
-        assert channel is not None  # noqa: S101 - narrowing: `_open` made it or raised
         try:
             channel.send((method, args, kwargs, caller()))
             if deadline is not None and not channel.poll(deadline.remaining_s() + ANSWER_MARGIN_S):
-                raise self._late(method, "its process may be busy or hung")
+                raise self._late(method)
             outcome, value = channel.receive()
         except (OSError, EOFError) as error:
-            self._drop()
+            channel.close()
             raise self._lost(error) from error
         except BaseException:  # late, or Ctrl-C: a late answer must not be taken for the next one
-            self._drop()
+            channel.close()
             raise
         return outcome, value
 
-    def _drop(self) -> None:
-        if self._channel is not None:
-            self._channel.close()
-        self._channel = None
+    def _taken(self) -> Channel | None:
+        """Return the connection that waits for a call, which then is the caller's; None while another call has it."""
+        with self._lock:
+            idle, self._idle = self._idle, None
+        return idle
 
-    def _late(self, method: str, why: str) -> DeviceTimeout:
+    def _keep(self, channel: Channel | None) -> None:
+        """Let a connection wait for the next call, and close the one that did so."""
+        with self._lock:
+            idle, self._idle = self._idle, channel
+        if idle is not None:
+            idle.close()
+
+    def _late(self, method: str) -> DeviceTimeout:
         return DeviceTimeout(
             f"{self._name}.{method} did not answer before its deadline",
-            hint=f"{why}; see `panelwright devices`",
+            hint="its process may be busy or hung; see `panelwright devices`",
             device=self._name,
         )
 

@@ -63,23 +63,22 @@ class IsolatedDevice:
         self._order = (context.name, context.cell, driver, options)
         self._report = report
         self._is_closed = threading.Event()
-        self._mine = threading.local()
         self._down: tuple[str, str] | None = None  # what and hint, while there is no process
         self._crashes_s: list[float] = []
         self._restarts = 0
         self._process = self._begin()
-        self._constants = self._proxy()  # keeps the names while the process is down
+        self._proxy = self._connected()
         self._watcher = threading.Thread(target=self._watch, name=f"watch-{self._name}", daemon=True)
         self._watcher.start()
 
     def __getattr__(self, attribute: str) -> Any:
         if attribute.startswith("_"):
             raise AttributeError(attribute)
-        value = getattr(self._constants, attribute)
+        value = getattr(self._proxy, attribute)
         return (lambda *args, **kwargs: self._call(attribute, *args, **kwargs)) if callable(value) else value
 
     def __dir__(self) -> list[str]:
-        return dir(self._constants)
+        return dir(self._proxy)
 
     def health(self) -> Health:
         """Return the state of the device, or of its driver while that is down; returns at once."""
@@ -102,15 +101,11 @@ class IsolatedDevice:
         down = self._down
         if down is not None:
             raise DeviceUnavailable(down[0], hint=down[1], device=self._name)
-        return getattr(self._proxy(), method)(*args, **kwargs)
+        return getattr(self._proxy, method)(*args, **kwargs)
 
-    def _proxy(self) -> Any:
-        """Return the calling thread's own connection, so that a slow read does not delay other threads or `health`."""
-        process = self._process
-        if getattr(self._mine, "process", None) is not process:
-            self._mine.proxy = connect(process.address, None, self._name, gone_hint=SOON)
-            self._mine.process = process
-        return self._mine.proxy
+    def _connected(self) -> Any:
+        """Return a proxy for the device in the present process, which keeps its names while that is down."""
+        return connect(self._process.address, None, self._name, gone_hint=SOON)
 
     def _begin(self) -> HostProcess:
         return HostProcess(_make_device, *self._order, name=self._name, give_up=self._is_closed)
@@ -127,7 +122,7 @@ class IsolatedDevice:
         log.error("%s", crashed)
         self._report("driver-down", {"device": self._name, "driver": self._driver, "exit": how})
         self._process.close()
-        if self._constants.kind == DeviceKind.GRIPPER:
+        if self._proxy.kind == DeviceKind.GRIPPER:
             why = "it is not restarted automatically, because its jaws may move when it connects"
             return self._stay_down(f"{crashed}; {why}", CLEAR_THE_HAND)
         pause_s, last = self._pause_s, crashed
@@ -138,6 +133,7 @@ class IsolatedDevice:
                 return False
             try:
                 self._process = self._begin()
+                self._proxy = self._connected()
             except CellError as error:
                 if self._is_closed.is_set():
                     return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import weakref
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from typing import Any, Protocol, cast
@@ -130,16 +129,13 @@ Connect = Callable[[str], Any]
 
 
 class RemoteConnection:
-    """A cell in another process. Each thread has its own proxies, so that a slow read does not delay other threads."""
+    """A cell in another process. A proxy's calls do not wait for each other, so that a slow read delays no other thread."""
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
         self._lock = threading.Lock()
         self._connect: Connect | None = None
-        self._generation = 0
-        self._proxies: list[tuple[str, weakref.ref[Any]]] = []  # each proxy lives as long as its thread
-        self._mine = threading.local()
-        self._swaps: dict[str, int] = {}
+        self._proxies: dict[str, Any] = {}
 
     def attach(self, connect: Connect) -> None:
         """Use a new cell process and drop the proxies of an earlier one."""
@@ -179,8 +175,8 @@ class RemoteConnection:
         self._proxy(PREFIX + SWAPPER).swap(name, section.driver, section.options, deadline=deadline)
         self.cell.file.devices[name] = section
         with self._lock:
-            self._swaps[name] = self._swaps.get(name, 0) + 1
-            self._proxies = [(other, proxy) for other, proxy in self._proxies if other != name]
+            old = self._proxies.pop(name, None)
+        _close_link(old)
 
     def close(self) -> None:
         """Close all proxies."""
@@ -189,21 +185,15 @@ class RemoteConnection:
     def _switch(self, connect: Connect | None) -> None:
         with self._lock:
             self._connect = connect
-            self._generation += 1
-            old, self._proxies = self._proxies, []
-        for _, reference in old:
-            if (proxy := reference()) is not None:
-                _close_link(proxy)
+            old, self._proxies = self._proxies, {}
+        for proxy in old.values():
+            _close_link(proxy)
 
     def _proxy(self, name: str) -> Any:
-        mine = self._mine.__dict__
-        if mine.get("generation") != self._generation:
-            mine.clear()
-            mine["generation"] = self._generation
-        swaps = self._swaps.get(name, 0)
-        if name in mine and mine[name][0] == swaps:
-            return mine[name][1]
-        connect = self._connect
+        with self._lock:
+            known, connect = self._proxies.get(name), self._connect
+        if known is not None:
+            return known
         if connect is None:
             raise DeviceUnavailable(
                 f"{name.removeprefix(PREFIX)} is unavailable: the cell process is not running",
@@ -211,11 +201,12 @@ class RemoteConnection:
                 device=name.removeprefix(PREFIX),
             )
         proxy = connect(name)
-        mine[name] = (swaps, proxy)
         with self._lock:
-            self._proxies = [item for item in self._proxies if item[1]() is not None]
-            self._proxies.append((name, weakref.ref(proxy)))
-        return proxy
+            is_present = self._connect is connect
+            kept = self._proxies.setdefault(name, proxy) if is_present else proxy
+        if kept is not proxy:  # another thread was faster
+            _close_link(proxy)
+        return kept
 
 
 def _close_link(proxy: Any) -> None:

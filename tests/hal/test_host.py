@@ -7,7 +7,6 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ import pytest
 
 from hal.clock import Deadline, PacedClock, WallClock
 from hal.errors import ConfigError, DeviceFault, DeviceTimeout, DeviceUnavailable
-from hal.host import HostServer, Proxy
+from hal.host import ANSWER_MARGIN_S, HostServer, Proxy
 from hal.host_process import HostProcess
 from hal.isolated import isolated_device
 from hal.readings import Stamped
@@ -114,7 +113,7 @@ def test_an_interrupted_call_does_not_leave_its_answer_to_the_next(host: HostPro
 
         def now_s(self) -> float:
             self.asked += 1
-            if self.asked > 2:  # the first two calls are for the proxy's lock and for the deadline in the request
+            if self.asked > 1:  # the first call is for the deadline in the request
                 raise KeyboardInterrupt
             return 0.0
 
@@ -124,20 +123,53 @@ def test_an_interrupted_call_does_not_leave_its_answer_to_the_next(host: HostPro
     assert proxy.double(np.ones(1)).value[0] == 2.0
 
 
-def test_a_call_behind_a_slow_one_ends_at_its_own_deadline(host: HostProcess) -> None:
-    proxy = host.proxy("calculator")
+class Gate:
+    """Object whose calls all wait until it is opened."""
 
-    def hang() -> None:
-        with suppress(DeviceTimeout, DeviceUnavailable):  # either the deadline or the end of the host comes first
-            proxy.hang(deadline=Deadline.after(WallClock(), 5.0))
+    def __init__(self) -> None:
+        self.arrived = threading.Semaphore(0)
+        self.opened = threading.Event()
 
-    slow = threading.Thread(target=hang, daemon=True)
-    slow.start()
-    while not proxy._lock.locked():
-        slow.join(0.001)
-    with pytest.raises(DeviceTimeout, match="remaining"):
-        proxy.remaining(deadline=Deadline.after(WallClock(), 0.01))
-    assert slow.is_alive()  # the call did not wait for the end of the slow one
+    def wait(self) -> None:
+        self.arrived.release()
+        assert self.opened.wait(30.0)
+
+    def look(self) -> int:
+        return 7
+
+
+def test_calls_at_the_same_time_do_not_wait_for_each_other_and_leave_one_connection(tmp_path: Path) -> None:
+    gate = Gate()
+    server = HostServer({"gate": gate}, str(tmp_path / "socket"), b"key", WallClock())
+    proxy = Proxy(server.address, b"key", "gate", WallClock())
+    slow = [threading.Thread(target=proxy.wait) for _ in range(5)]
+    for thread in slow:
+        thread.start()
+    for _ in slow:
+        assert gate.arrived.acquire(timeout=30.0)
+    assert proxy.look() == 7
+    gate.opened.set()
+    for thread in slow:
+        thread.join(30.0)
+    assert proxy.look() == 7
+    while len(server._connections) > 1:  # a thread of the server notices later that its client has hung up
+        slow[0].join(0.001)
+    server.close()
+
+
+def test_a_host_that_accepts_nobody_is_a_timeout(tmp_path: Path) -> None:
+    address = str(tmp_path / "socket")
+    server = HostServer(make(), address, b"key", WallClock())
+    proxy = Proxy(address, b"key", "calculator", WallClock())
+    server.close()
+    (tmp_path / "socket").unlink(missing_ok=True)
+    with pytest.raises(DeviceUnavailable, match="has ended"):
+        proxy.double(np.ones(1))
+    with socket.socket(socket.AF_UNIX) as deaf:
+        deaf.bind(address)
+        deaf.listen(1)
+        with pytest.raises(DeviceTimeout, match="connect"):
+            proxy.remaining(deadline=Deadline.after(WallClock(), -ANSWER_MARGIN_S))
 
 
 def test_constants_are_known_and_unknown_names_are_not(host: HostProcess) -> None:

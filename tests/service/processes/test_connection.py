@@ -1,9 +1,8 @@
-"""The service's connection to a cell process has one proxy per thread, and none outlives its thread."""
+"""The service's connection to a cell process has one proxy per device, which goes with the process."""
 
 from __future__ import annotations
 
 import threading
-import weakref
 from pathlib import Path
 
 import pytest
@@ -24,21 +23,25 @@ class Wire:
         self.is_open = False
 
 
-def test_the_proxies_of_a_thread_go_with_it() -> None:
-    made: list[weakref.ref[Wire]] = []
+def test_all_threads_share_the_proxy_of_a_device() -> None:
+    made: list[Wire] = []
+    got: list[Wire] = []
+    both = threading.Barrier(2)
 
     def connect(_name: str) -> Wire:
-        made.append(weakref.ref(wire := Wire()))
+        both.wait(30.0)  # two threads that connect at the same time
+        made.append(wire := Wire())
         return wire
 
     connection = RemoteConnection(CELL)
     connection.attach(connect)
-    for _ in range(3):
-        thread = threading.Thread(target=lambda: connection.device("arm"))
+    threads = [threading.Thread(target=lambda: got.append(connection.device("arm"))) for _ in range(2)]
+    for thread in threads:
         thread.start()
-        thread.join(10.0)
-    assert [wire() for wire in made] == [None] * 3
-    assert connection.device("arm") is connection.device("arm") is made[-1]()
+    for thread in threads:
+        thread.join(30.0)
+    assert got[0] is got[1] is connection.device("arm")
+    assert sorted(wire.is_open for wire in made) == [False, True]
 
 
 def test_a_cell_that_has_gone_takes_its_proxies_along() -> None:

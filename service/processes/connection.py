@@ -141,6 +141,11 @@ class RemoteConnection:
         """Use a new cell process and drop the proxies of an earlier one."""
         self._switch(connect)
 
+    def open(self) -> None:
+        """Connect to every device now, so that no first call has to, and each cell process has as many connections."""
+        for name in self.cell.file.devices:
+            self.device(name)
+
     def detach(self) -> None:
         """Note that the cell process has ended."""
         self._switch(None)

@@ -285,6 +285,7 @@ class Supervisor:
             raise errors[0]
         clock = connect(order.address, bytes.fromhex(order.authkey), "cell.clock")
         self._remote.attach(lambda name: connect(order.address, bytes.fromhex(order.authkey), name, clock=clock))
+        self._remote.open()
         self._problem = None
         self._ready_at_s = time.monotonic()
         self._is_ready.set()

@@ -3,29 +3,35 @@
 Under a mix: missions, readings, pictures, listeners of the stream that come and go, stops with resets, and broken requests. Or
 under chaos, which breaks something in each mission; `--same-service` leaves out the two faults that end the service, because a
 service that lives for minutes only shows no slow growth. The memory that each process has for itself (unique set size) and its
-open descriptors are sampled. After the first minutes, in which libraries and kernels load, the memory may grow by 5 MB and the
-descriptors not at all. Prints a table, the breaches of the chaos and the pass line.
+open descriptors are sampled: every 5 s under the mix, and between the rounds of the chaos, when no task runs.
+
+After the first minutes, in which libraries and kernels load, the memory may grow by 5 MB and the descriptors not at all. A process
+that has just begun has loaded less than one that has worked, and chaos replaces processes all the time. So like is compared with
+like: the median of all samples after the same number of rounds is subtracted from each. Prints a table, with what has grown that
+way, the breaches of the chaos and the pass line.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import psutil
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from benchmarks.kills import all_rounds, chaos_on
+from benchmarks.kills import chaos_on
+from hal.arrays import Array
 from hal.errors import CellError
 from service.chaos.family import roles_of
 from service.chaos.faults import FAULTS
@@ -39,9 +45,27 @@ EVERY_S = 5.0
 STOP_EVERY_S = 180.0  # so that missions also come to their ends and write their reports
 PASS_MB = 5.0
 WINDOW = 0.2  # of the samples: the medians of the first and the last ones are compared
+LIKE_AFTER = 6  # rounds, after which a process loads no more
+REST_S = 1.5  # after a round, until its last requests are answered
 ROLES = ("service", "cell", "stop", "world")
-Samples = dict[str, list[tuple[float, float]]]
-"""Memory in MB and descriptors of each role, one pair a sample."""
+
+
+class Sample(NamedTuple):
+    """A look at a process.
+
+    Attributes:
+        worked: number of rounds since the process began; 0 under the mix.
+        memory_mb: its unique set size.
+        descriptors: number of open ones.
+    """
+
+    worked: int
+    memory_mb: float
+    descriptors: float
+
+
+Samples = dict[str, list[Sample]]
+"""The looks at the process of each role, in the order of time."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -57,16 +81,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         work = _mixed if given.chaos is None else partial(_broken, given.chaos, given.same_service)
         samples, breaches = work(plant, given.minutes, given.settle)
         tracebacks = sum("Traceback" in line for line in plant.lines)
-    print(
-        "| process | MB at first | at last | grown | descriptors at first | at last |\n| --- | --- | --- | --- | --- | --- |"
-    )
+    print("| process | MB at first | at last | grown | descriptors at first | at last | grown |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     grown_mb, more = 0.0, 0.0
     for role, rows in samples.items():
         part = max(1, round(WINDOW * len(rows)))
-        first, last = np.median(rows[:part], axis=0), np.median(rows[-part:], axis=0)
-        grown_mb, more = grown_mb + max(0.0, last[0] - first[0]), more + max(0.0, last[1] - first[1])
+        first, last = (np.median([row[1:] for row in some], axis=0) for some in (rows[:part], rows[-part:]))
+        like = _without_levels(rows)
+        mb, descriptors = np.median(like[-part:], axis=0) - np.median(like[:part], axis=0)
+        grown_mb, more = grown_mb + max(0.0, mb), more + max(0.0, descriptors)
         print(
-            f"| {role} | {first[0]:.1f} | {last[0]:.1f} | {last[0] - first[0]:+.1f} | {first[1]:.0f} | {last[1]:.0f} |"
+            f"| {role} | {first[0]:.1f} | {last[0]:.1f} | {mb:+.1f} | {first[1]:.0f} | {last[1]:.0f} | {descriptors:+.1f} |"
         )
     print(
         f"memory {grown_mb:+.1f} MB after {given.settle:.0f} of {given.minutes:.0f} minutes (pass: +{PASS_MB:.0f}), descriptors "
@@ -97,28 +122,46 @@ def _broken(seed: int, same_service: bool, plant: Plant, minutes: float, settle:
     """Return the samples under chaos, and the number of its breaches."""
     faults = tuple(fault.name for fault in FAULTS if not (same_service and fault.restarts))
     chaos = chaos_on(plant, CELL, ChaosOptions(seed=seed, minutes=minutes, faults=faults))
-    end = threading.Event()
-    with ThreadPoolExecutor(1) as watcher:
-        found = watcher.submit(_sampled, plant, end, minutes=minutes, settle=settle)
-        try:
-            *rounds, final = all_rounds(chaos)
-        finally:
-            end.set()
-    breaches = [f"{one.fault}: {breach}" for one in (*rounds, final) for breach in one.breaches]
+    begun_s = time.monotonic()
+    rows: Samples = {role: [] for role in ROLES}
+    known: dict[str, tuple[int, int]] = {}  # process id of each role, and the rounds since it began
+    rounds = []
+    for one in chaos.rounds(lambda one: print(f"  {one}", file=sys.stderr, flush=True)):
+        rounds.append(one)
+        time.sleep(REST_S)
+        for role, process in roles_of(plant.pid).items():
+            pid, worked = known.get(role, (0, 0))
+            known[role] = (process.pid, worked + 1 if pid == process.pid else 0)
+            if time.monotonic() - begun_s >= 60.0 * settle:
+                _add(rows[role], process.pid, worked=known[role][1])
+    breaches = [f"{one.fault}: {breach}" for one in (*rounds, chaos.final) for breach in one.breaches]
     print("\n".join([f"{len(rounds)} rounds in {plant.life} lives of the service", *breaches]))
-    return found.result(), len(breaches)
+    return rows, len(breaches)
 
 
 def _sampled(plant: Plant, end: threading.Event, *, minutes: float, settle: float) -> Samples:
-    """Return memory in MB and descriptors of each role, sampled after the time to settle."""
+    """Return the samples of the time after that to settle."""
     begun_s = time.monotonic()
     rows: Samples = {role: [] for role in ROLES}
     while (passed_s := time.monotonic() - begun_s) < 60.0 * minutes and not end.wait(EVERY_S):
         for role, process in roles_of(plant.pid).items() if passed_s >= 60.0 * settle else ():
-            with suppress(psutil.Error):
-                one = psutil.Process(process.pid)
-                rows[role].append((one.memory_full_info().uss / 1e6, float(one.num_fds())))
+            _add(rows[role], process.pid, worked=0)
     return rows
+
+
+def _add(rows: list[Sample], pid: int, *, worked: int) -> None:
+    with suppress(psutil.Error):
+        one = psutil.Process(pid)
+        rows.append(Sample(worked, one.memory_full_info().uss / 1e6, float(one.num_fds())))
+
+
+def _without_levels(rows: Sequence[Sample]) -> Array:
+    """Return memory and descriptors (N, 2) without the medians of the samples after the same number of rounds."""
+    worked = np.minimum([row.worked for row in rows], LIKE_AFTER)
+    values = np.array([row[1:] for row in rows])
+    for count in np.unique(worked):
+        values[worked == count] -= np.median(values[worked == count], axis=0)
+    return values
 
 
 def _repeat(number: int, plant: Plant, end: threading.Event, done: list[int]) -> None:

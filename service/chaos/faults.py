@@ -21,6 +21,7 @@ from service.client import ApiError
 
 SILENT_CONNECTIONS = 300
 QUEUED_TASKS = 40
+LAPSED_S = 3.0  # a lease of 2 s has lapsed, and the step that runs has noticed
 GARBAGE = 60
 ENDS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 # No beginning of one is an object, which some verbs take as a request.
@@ -60,6 +61,7 @@ class ChaosFault:
     Attributes:
         latches: whether the stop must be latched afterwards, without anybody's doing.
         ends: whether the task must end without success while the fault lasts.
+        acts_after_s: until then the fault reaches no task, so that one which is nearly done may still succeed.
         restarts: whether the service ends by it, so that it is started again.
         lasts_s: how long it lasts before it is undone, unless everything that must follow has followed before.
     """
@@ -68,6 +70,7 @@ class ChaosFault:
     begin: Callable[[Scene], Broken]
     latches: bool = False
     ends: bool = False
+    acts_after_s: float = 0.0
     restarts: bool = False
     lasts_s: float = 3.0
 
@@ -221,7 +224,7 @@ FAULTS = (
     ChaosFault(name="hang world", begin=_hang("world"), latches=True, ends=True, lasts_s=15.0),
     ChaosFault(name="hang stop", begin=_hang("stop"), latches=True, ends=True, lasts_s=10.0),
     ChaosFault(name="silence device", begin=_silence_device, lasts_s=4.0),
-    ChaosFault(name="silence client", begin=_silence_client, ends=True, lasts_s=10.0),
+    ChaosFault(name="silence client", begin=_silence_client, ends=True, acts_after_s=LAPSED_S, lasts_s=10.0),
     ChaosFault(name="silent connections", begin=_silent_connections),
     ChaosFault(name="corrupt requests", begin=_corrupt_requests),
     ChaosFault(name="fill disk", begin=_fill_disk, ends=True, lasts_s=10.0),

@@ -136,10 +136,15 @@ class Chaos:
             done.followed_s = time.monotonic() - begun_s
         if fault.latches and not has_latched:
             done.breaches.append(f"the stop was not latched within {fault.lasts_s:.0f} s")
-        if fault.ends and not was_over and (not has_ended or self._state(task_id) == "succeeded"):
-            done.breaches.append(f"the task went on for {fault.lasts_s:.0f} s as if nothing had happened")
+        lasted_s = time.monotonic() - begun_s
+        if fault.ends and not was_over and not (has_ended and self._may_have_ended(task_id, fault, lasted_s)):
+            done.breaches.append(f"the task went on for {lasted_s:.0f} s as if nothing had happened")
         if not fault.latches:
             self._stop_meanwhile(done, fault)
+
+    def _may_have_ended(self, task_id: str, fault: ChaosFault, lasted_s: float) -> bool:
+        """Return whether the fault explains how a task has ended: not by success, except before it acts."""
+        return lasted_s < fault.acts_after_s or self._state(task_id) != "succeeded"
 
     def _is_over(self, task_id: str, fault: ChaosFault) -> bool:
         """Return whether a task has succeeded, or only its report is left, which a fault that ends motions need not end."""

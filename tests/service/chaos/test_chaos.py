@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from hal.child_python import module_command
 from service.chaos.acks import Ack, missing
-from service.chaos.faults import FAULTS, ODD_BODIES, ends
+from service.chaos.faults import FAULTS, LAPSED_S, ODD_BODIES, ends
 from service.chaos.judge import last_line, unnamed
 from service.chaos.options import ChaosOptions, Round
 from service.chaos.plant import Plant
@@ -143,6 +143,25 @@ def test_a_mission_that_only_writes_its_report_need_not_be_ended_by_a_fault_that
     monkeypatch.setattr(Plant, "state_of", lambda _self, _id: {"state": state, "step": step})
     chaos = Chaos(plant, ChaosOptions(), arm="arm", devices=())
     assert chaos._is_over("a task", next(one for one in FAULTS if one.name == fault)) is is_over
+
+
+@pytest.mark.parametrize(
+    ("state", "fault", "lasted_s", "may"),
+    [
+        ("succeeded", "silence client", LAPSED_S - 0.1, True),
+        ("succeeded", "silence client", LAPSED_S + 0.1, False),
+        ("cancelled", "silence client", 9.0, True),
+        ("succeeded", "kill cell", 0.1, False),
+        ("failed", "kill cell", 0.1, True),
+    ],
+)
+def test_a_task_may_succeed_as_long_as_the_lease_of_a_silent_client_holds(
+    state: str, fault: str, lasted_s: float, may: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant = Plant(command=lambda *_: [], runs=tmp_path)
+    monkeypatch.setattr(Plant, "state_of", lambda _self, _id: {"state": state, "step": ""})
+    chaos = Chaos(plant, ChaosOptions(), arm="arm", devices=())
+    assert chaos._may_have_ended("a task", next(one for one in FAULTS if one.name == fault), lasted_s) is may
 
 
 def test_every_fault_has_a_name_of_its_own_and_can_be_chosen() -> None:

@@ -24,6 +24,8 @@ FACE_RADII = np.linspace(*FACE, 11)
 # Radii at which a gap around the cap is searched for; inner part of the face
 GAP, INNER = np.linspace(0.5, 1.12, 32), (0.35, 0.50)
 GAP_DARK = 0.85  # share of the gray of face and plate: a gap is darker than both
+BLACK = 20.0  # gray levels: noise on a darker face is as strong as a highlight, or as a gap
+LEAST_BEYOND = 0.5  # share that must be visible beyond a spot: glare that comes from there is saturated at first
 LEAST_GAP = 0.6  # share of it that must be visible
 SPOT_TO = 0.46  # in radii: glare from beside the cap is brightest farther out
 CLEAR_OF_RING = 1.4  # in radii: anything that crosses a circle of this size does not belong to the button
@@ -97,9 +99,10 @@ def _spot(patch: Patch, unknown: NDArray[np.uint8], radius_m: float, level: floa
     inner = FACE_RADII <= SPOT_TO
     row, turn = np.unravel_index(int(mean[inner].argmax()), mean[inner].shape)
     beyond = mean[-2:, (int(turn) + np.arange(-3, 4)) % len(ANGLES)]
-    beyond = beyond[np.isfinite(beyond)]
-    found = float(mean[row, turn]) - max(float(beyond.mean()) if len(beyond) else 0.0, 0.0)
-    is_blind = WHITE_LEVEL - float(np.median(gray[known])) < HEADROOM * level
+    is_known = np.isfinite(beyond)
+    face = float(np.median(gray[known]))
+    is_blind = not BLACK < face < WHITE_LEVEL - HEADROOM * level or is_known.mean() < LEAST_BEYOND
+    found = float(mean[row, turn]) - max(float(beyond[is_known].mean()) if is_known.any() else 0.0, 0.0)
     return np.nan if is_blind or not np.isfinite(found) else found / (scale + SMOOTH * level)
 
 
@@ -116,7 +119,7 @@ def _below(patch: Patch, unknown: NDArray[np.uint8], radius_m: float) -> float:
     face, _ = _mean_round(patch, unknown, radius_m * np.linspace(*INNER, 4))
     beside = np.minimum(*(WAVES @ _wave(part, known) for part in (face, gray[-6:].mean(axis=0))))
     beside = np.maximum(beside, 1.0)
-    if float(np.median((gray.min(axis=0) / beside)[known])) > GAP_DARK:
+    if float(np.median(beside)) < BLACK or float(np.median((gray.min(axis=0) / beside)[known])) > GAP_DARK:
         return 0.0
     dark = np.maximum(beside - gray, 0.0).sum(axis=0) * (GAP[1] - GAP[0])
     return -float(_wave(dark, known)[1] / np.median(beside))

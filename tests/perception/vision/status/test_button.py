@@ -15,6 +15,7 @@ from perception.vision.status.button import read_button
 from perception.vision.status.press import CapHeight, cap_height
 
 SIZE, PX_PER_M = 160, 2500.0
+SURE = 0.8
 LEAN = 0.42  # tangent of the camera's viewing angle
 BUTTON = Button(kind="button", name="hold", position_m=(0.0, 0.0), radius_m=0.013, latching=True)
 
@@ -184,3 +185,24 @@ def test_a_cap_whose_gap_is_dark_below_is_not_called_pressed() -> None:
     assert read_button(seen_from_ahead(4.0), BUTTON).state in ("released", None)
     for below_px in (0.0, -4.0):
         assert read_button(seen_from_ahead(below_px), BUTTON).state == "pressed"
+
+
+@pytest.mark.parametrize("seed", [3, 6, 8, 14, 31, 35])
+def test_noise_on_a_black_cap_is_not_its_shine(seed: int) -> None:
+    """The camera cuts the noise of a black face off at zero, so that what is left of it looks like bright spots."""
+    v, u = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
+    picture = np.where(np.hypot(u, v) < BUTTON.radius_m * PX_PER_M, 6.0, 90.0)
+    noise = np.random.default_rng(seed).normal(0.0, 14.0, picture.shape)
+    seen = cv2.GaussianBlur(picture, (0, 0), 1.5) + cv2.GaussianBlur(noise, (0, 0), 0.7)
+    patch = replace(seen_straight(is_released=False), gray=np.clip(np.round(seen), 0, 255).astype(np.uint8))
+    assert read_button(patch, BUTTON).state != "released"
+
+
+@pytest.mark.parametrize(("at_m", "size_m"), [(0.010, 0.006), (0.012, 0.009), (0.014, 0.006)])
+def test_glare_that_saturates_beside_a_cap_is_not_its_shine(at_m: float, size_m: float) -> None:
+    plain = seen_straight(is_released=False)
+    v, u = (np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2) / PX_PER_M
+    glare = 2.0 * np.exp(-0.5 * (np.hypot(u - at_m, v - at_m) / size_m) ** 2)
+    seen = 255 * ((plain.gray / 255.0) ** 2.2 + glare) ** (1 / 2.2)
+    found = read_button(replace(plain, gray=np.clip(np.round(seen), 0, 255).astype(np.uint8)), BUTTON)
+    assert found.state != "released" or found.confidence < SURE

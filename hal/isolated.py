@@ -66,8 +66,7 @@ class IsolatedDevice:
         self._down: tuple[str, str] | None = None  # what and hint, while there is no process
         self._crashes_s: list[float] = []
         self._restarts = 0
-        self._process = self._begin()
-        self._proxy = self._connected()
+        self._begin()
         self._watcher = threading.Thread(target=self._watch, name=f"watch-{self._name}", daemon=True)
         self._watcher.start()
 
@@ -103,12 +102,16 @@ class IsolatedDevice:
             raise DeviceUnavailable(down[0], hint=down[1], device=self._name)
         return getattr(self._proxy, method)(*args, **kwargs)
 
-    def _connected(self) -> Any:
-        """Return a proxy for the device in the present process, which keeps its names while that is down."""
-        return connect(self._process.address, None, self._name, gone_hint=SOON)
-
-    def _begin(self) -> HostProcess:
-        return HostProcess(_make_device, *self._order, name=self._name, give_up=self._is_closed)
+    def _begin(self) -> None:
+        """Start a process, and make a proxy for its device, which keeps its names while the process is down."""
+        process = HostProcess(_make_device, *self._order, name=self._name, give_up=self._is_closed)
+        try:
+            self._proxy = connect(process.address, None, self._name, gone_hint=SOON)
+        except CellError as error:
+            process.close()
+            error.details[EXIT] = process.await_end()
+            raise
+        self._process = process
 
     def _watch(self) -> None:
         while True:
@@ -132,8 +135,7 @@ class IsolatedDevice:
             if self._is_closed.wait(pause_s):
                 return False
             try:
-                self._process = self._begin()
-                self._proxy = self._connected()
+                self._begin()
             except CellError as error:
                 if self._is_closed.is_set():
                     return False

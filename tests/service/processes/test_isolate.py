@@ -14,6 +14,7 @@ import pytest
 from hal.clock import Deadline, WallClock
 from hal.config import Cell, load_cell
 from hal.errors import ConfigError, DeviceUnavailable
+from hal.host import connect
 from hal.isolated import IsolatedDevice
 from hal.registry import Context
 from service.processes.cell import CellRuntime
@@ -111,6 +112,27 @@ def test_a_driver_that_crashes_too_often_stays_down(start: Start, trouble: Path,
         read(device)
     assert f"panelwright devices connect {NAME}" in down.value.hint
     assert children() == []
+
+
+def test_a_driver_that_dies_before_it_is_reached_counts_as_a_crash_and_leaves_nothing(
+    start: Start, notes: Notes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = start(max_restarts=1)
+    folders: list[Path] = []
+
+    def connect_too_late(address: str, *args: Any, **how: Any) -> Any:
+        folders.append(Path(address).parent)
+        children()[0].kill()
+        eventually(lambda: children() == [])
+        return connect(address, *args, **how)
+
+    monkeypatch.setattr("hal.isolated.connect", connect_too_late)
+    children()[0].kill()
+    eventually(lambda: notes and notes[-1][0] == "driver-stays-down")
+    with pytest.raises(DeviceUnavailable, match="2 crashes within 60 s"):
+        read(device)
+    assert len(folders) == 1
+    assert not folders[0].exists()
 
 
 def test_a_gripper_is_left_to_a_person(start: Start, notes: Notes) -> None:

@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from hal.arrays import Array
 from hal.panel import Slider
 from perception.vision.image import WHITE_LEVEL
 from perception.vision.patch import Patch, sample_at
-from perception.vision.reading import PatchReading, doubted, gated, probability, refused
+from perception.vision.reading import ANSWER_AT, PatchReading, doubted, gated, probability, refused
 from perception.vision.status.choice import contrast_noise
 from perception.vision.status.occluder_bands import lying_across
 from perception.vision.status.reader import Reader
-from perception.vision.status.track import track_shift
+from perception.vision.status.track import BOX_M, track_shift
 
 SLOT = 0.2  # share of the cap's width: half of the slot plus its blur
 EDGE_BOX = 0.22  # share of the cap's length; a line across its middle is farther than this from its edges
@@ -30,7 +31,9 @@ LINE, LINE_FLANK, LINE_WIDTH = 0.05, 0.15, 0.10
 LINE_NEAR = 0.17
 # Least contrast of a line: in sigmas of the contrast's noise, and as a share of the cap's edge
 LINE_NOISES, LINE_SHARE = 2.0, 0.15
+LINE_SURE = 0.12  # in cap lengths from the middle of the edges: what lies further is often the edge of a cable
 NO_LINE = 0.75  # of 12 caps in bad light without a visible line 8 were correct, because cables and glare resemble caps
+RIGHT = 0.02  # share of the travel within which a reading is right
 PLACE_PX = 0.35  # standard deviation of the middle of a cap, image px
 BEYOND, MOST_BEYOND = 0.8, 0.4  # in cap widths from the track; share that may be as dark there
 SIDES = np.linspace(-0.40, 0.40, 17)  # in cap widths: inside the cap
@@ -61,7 +64,8 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     least = max(LINE_NOISES * noise, LINE_SHARE * found.peak)
     line_m = _line(left, right, s, open_, near_m=found.place_m, along_m=along, least=least)
     cap_m = found.place_m if line_m is None else line_m
-    track = track_shift(patch, spec, cap_m=cap_m)
+    is_open = _near(1.0 - open_, BOX_M / step) < 0.5
+    track = track_shift(patch, spec, cap_m=cap_m, is_open=lambda at_m: float(np.interp(at_m, s, is_open)) > 0.99)
     place = float(np.clip(cap_m - track.shift_m, lo, hi))
     slope = abs(spec.scale.value_at(place + 1e-4) - spec.scale.value_at(place - 1e-4)) / 2e-4
     confidence = probability(
@@ -70,13 +74,17 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
             (np.log((found.rival + noise) / (found.peak + noise)), np.log(0.7), -0.12),
         ]
     )
-    if line_m is None:
+    if line_m is None or abs(line_m - found.place_m) > LINE_SURE * along:
         confidence *= NO_LINE
+    sigma_m = float(np.hypot(PLACE_PX / patch.image_px_per_m, track.sigma_m))
+    near = float(
+        erf(RIGHT * spec.travel_m / sigma_m / np.sqrt(2.0))
+    )  # alone it refuses nothing: the answer says its sigma
     status = PatchReading(
         value=spec.scale.value_at(place),
         unit=spec.scale.unit,
-        uncertainty=slope * float(np.hypot(PLACE_PX / patch.image_px_per_m, track.sigma_m)),
-        confidence=confidence,
+        uncertainty=slope * sigma_m,
+        confidence=max(confidence * near, min(confidence, ANSWER_AT)),
     )
     return gated(status) if found.peak >= 2.0 * noise else doubted(status, unseen)
 

@@ -6,6 +6,7 @@ therefore read relative to the middle of its own slot, which has the same error.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,8 @@ LEAST_NOISES, LEAST_SHARE = 4.0, 0.5  # least contrast of an end in sigmas of it
 UNEQUAL_M, UNEQUAL_SHARE = 0.0007, 0.005
 CAP_ROOM_M = 0.003  # an end nearer to the cap than this may be the edge of the cap or of its shadow
 BOTH_SIGMA_M = 0.0002  # with both ends; the cap's own building tolerance
+# With both ends of a slot that ends before the cap does, so that only their likeness tells them from other edges.
+SHORT_SIGMA_M, SHORT_SHARE = 0.0003, 0.7
 ONE_SIGMA_M = 0.0005  # with one end, as the file does not state by how much the slot is longer than the way
 NONE_SIGMA_M = 0.0008  # without one, where the cap hides both: RMS error of 43 registered close-ups on random panels
 # With an end that is not where it should be seen, within the reach of the search: then the pose is wrong by more, as that of
@@ -40,32 +43,43 @@ class TrackShift:
     sigma_m: float
 
 
-def track_shift(patch: Patch, spec: Slider, *, cap_m: float) -> TrackShift:
+def track_shift(patch: Patch, spec: Slider, *, cap_m: float, is_open: Callable[[float], bool]) -> TrackShift:
     """Return how far the slot lies from where the patch should show it; zero with a large sigma if no end is found.
 
     Args:
         cap_m: place of the cap on the track, which may hide one end.
+        is_open: whether nothing lies across the track near a place, m.
     """
     half_m = (spec.travel_m + spec.cap_size_m[0]) / 2
     room_m = spec.cap_size_m[0] / 2 + abs(patch.growth_per_m) * spec.cap_size_m[2] * half_m + CAP_ROOM_M
-    ends = [_end(patch, spec, sign * half_m) for sign in (-1.0, 1.0) if abs(sign * half_m - cap_m) > room_m]
-    most_m = PLACED_M if patch.is_placed else REACH_M + BOX_M
+    sides = [sign for sign in (-1.0, 1.0) if abs(sign * half_m - cap_m) > room_m]
+    profiles = [_contrast(patch, spec, sign * half_m) for sign in sides]
     least = LEAST_NOISES * contrast_noise(patch)
-    seen = [(at, contrast) for at, contrast in ends if abs(contrast) >= least]
+    seen = max((_ends(profiles, shade, least) for shade in (1.0, -1.0)), key=_weakest)
+    most_m = PLACED_M if patch.is_placed else REACH_M + BOX_M
     if len(seen) == 2:
-        (low, low_contrast), (high, high_contrast) = seen
+        (low_m, low_contrast), (high_m, high_contrast) = seen
         ratio = low_contrast / high_contrast
-        unequal_m = UNEQUAL_M + UNEQUAL_SHARE * half_m
-        is_slot = LEAST_SHARE <= ratio <= 1.0 / LEAST_SHARE and abs(high - low) / 2 <= unequal_m
-        if is_slot and abs(low + high) / 2 <= most_m:
-            return TrackShift(shift_m=(low + high) / 2, sigma_m=BOTH_SIGMA_M)
-    elif len(ends) == 1 and len(seen) == 1 and abs(seen[0][0]) <= most_m:
+        shift_m, longer_m = (low_m + high_m) / 2, (high_m - low_m) / 2
+        alike, is_near = min(ratio, 1.0 / ratio), abs(shift_m) <= most_m
+        if is_near and alike >= LEAST_SHARE and abs(longer_m) <= UNEQUAL_M + UNEQUAL_SHARE * half_m:
+            return TrackShift(shift_m=shift_m, sigma_m=BOTH_SIGMA_M)
+        is_clear = all(is_open(at) and abs(at - cap_m) > room_m for at in (low_m - half_m, high_m + half_m))
+        if (
+            is_near
+            and alike >= SHORT_SHARE
+            and is_clear
+            and patch.is_placed
+            and -spec.cap_size_m[0] / 2 <= longer_m < 0.0
+        ):
+            return TrackShift(shift_m=shift_m, sigma_m=SHORT_SIGMA_M)
+    elif len(sides) == 1 and len(seen) == 1 and abs(seen[0][0]) <= most_m:
         return TrackShift(shift_m=seen[0][0], sigma_m=ONE_SIGMA_M)
-    return TrackShift(shift_m=0.0, sigma_m=MISSED_SIGMA_M if ends and not patch.is_placed else NONE_SIGMA_M)
+    return TrackShift(shift_m=0.0, sigma_m=MISSED_SIGMA_M if sides and not patch.is_placed else NONE_SIGMA_M)
 
 
-def _end(patch: Patch, spec: Slider, end_m: float) -> tuple[float, float]:
-    """Return the displacement of the slot's end from `end_m`, m, and how much brighter the plate is than the slot."""
+def _contrast(patch: Patch, spec: Slider, end_m: float) -> tuple[Array, Array]:
+    """Return how much brighter the plate beyond is than the slot before (N,), by the displacement from `end_m` (N,), m."""
     s = end_m + np.sign(end_m) * np.arange(-REACH_M - BOX_M, REACH_M + BOX_M + STEP_M / 2, STEP_M)
     across = np.linspace(-INSIDE_M, INSIDE_M, 5)
     c, sin = np.cos(spec.angle_rad), np.sin(spec.angle_rad)
@@ -74,6 +88,15 @@ def _end(patch: Patch, spec: Slider, end_m: float) -> tuple[float, float]:
     n = round(BOX_M / STEP_M)
     total = np.concatenate([[0.0], np.cumsum(gray)])
     at = np.arange(n, len(gray) - n + 1)
-    step: Array = (total[at + n] - 2.0 * total[at] + total[at - n]) / n
-    k = int(np.abs(step).argmax())
-    return float(s[at[k]] - end_m) - float(np.sign(end_m)) * STEP_M / 2, float(step[k])
+    return s[at] - end_m - np.sign(end_m) * STEP_M / 2, (total[at + n] - 2.0 * total[at] + total[at - n]) / n
+
+
+def _ends(profiles: list[tuple[Array, Array]], shade: float, least: float) -> list[tuple[float, float]]:
+    """Return the displacement and the contrast of every end of a slot that is darker (1) or brighter (-1) than the plate."""
+    ends = [(at, shade * contrast) for at, contrast in profiles]
+    return [(float(at[k]), float(c[k])) for at, c in ends for k in [int(c.argmax())] if c[k] >= least]
+
+
+def _weakest(ends: list[tuple[float, float]]) -> tuple[int, float]:
+    """Return by what ends are compared: their number, and their least contrast."""
+    return len(ends), min((contrast for _, contrast in ends), default=0.0)

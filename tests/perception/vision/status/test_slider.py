@@ -16,7 +16,7 @@ from perception.vision.patch import Patch
 from perception.vision.projection import CameraProjection
 from perception.vision.status.reader import patch_of
 from perception.vision.status.slider import read_slider
-from perception.vision.status.track import track_shift
+from perception.vision.status.track import TrackShift, track_shift
 
 TRAVEL_M = 0.100
 CORNERS = ((-0.15, 0.12), (0.15, 0.12), (0.15, -0.12), (-0.15, -0.12))
@@ -88,23 +88,57 @@ def test_an_error_of_the_pose_along_the_track_does_not_move_the_cap(shown: float
     assert status.uncertainty is not None and abs(status.value - shown) < 3.0 * status.uncertainty < 2.0
 
 
-@pytest.mark.parametrize("is_placed", [True, False])
-def test_what_lies_further_off_than_a_panel_is_built_is_no_end_of_the_slot_where_the_border_was_seen(
-    is_placed: bool,
-) -> None:
-    """A stripe on the plate beyond each end of the slot looks like its ends, moved by 3 mm."""
-    slider = Slider(name="speed", position_m=(0.0, 0.0), angle_rad=0.0, travel_m=TRAVEL_M, scale=SCALE)
-    px_per_m, half_m = 4000.0, (TRAVEL_M + slider.cap_size_m[0]) / 2
+BARE = Slider(name="speed", position_m=(0.0, 0.0), angle_rad=0.0, travel_m=TRAVEL_M, scale=SCALE)
+
+
+def slot_shift(
+    ends_m: tuple[float, float],
+    *,
+    is_placed: bool = True,
+    hose_m: tuple[float, float] | None = None,
+    is_open: bool = True,
+) -> TrackShift:
+    """Return the shift of a slot between two places, m, with a dark hose between two others; the cap is in the middle."""
+    px_per_m, half_m = 4000.0, (TRAVEL_M + BARE.cap_size_m[0]) / 2
     picture = np.full((240, round(2 * half_m * px_per_m) + 160), 150.0)
     middle = np.array([(picture.shape[1] - 1) / 2, (picture.shape[0] - 1) / 2])
-    low, high = (round(middle[0] + (side * half_m + 0.003) * px_per_m) for side in (-1.0, 1.0))
-    picture[round(middle[1]) - 5 : round(middle[1]) + 6, low:high] = 40.0
+    for (low_m, high_m), gray in (((ends_m), 40.0), (hose_m or (0.0, 0.0), 20.0)):
+        low, high = (round(middle[0] + at_m * px_per_m) for at_m in (low_m, high_m))
+        picture[round(middle[1]) - 5 : round(middle[1]) + 6, low:high] = gray
     noise = np.random.default_rng(3).normal(0.0, 1.0, picture.shape)
     patch = Patch(
         gray=np.clip(picture + noise, 0, 255).astype(np.uint8), colour=None, inside=np.ones(picture.shape, bool),
         px_per_m=px_per_m, image_px_per_m=px_per_m / 1.5, origin_px=middle, parallax_px_per_m=np.zeros(2), growth_per_m=0.0,
         plane_z_m=0.0, is_placed=is_placed,
     )  # fmt: skip
-    track = track_shift(patch, slider, cap_m=0.0)
+    return track_shift(patch, BARE, cap_m=0.0, is_open=lambda _at_m: is_open)
+
+
+@pytest.mark.parametrize("shorter_m", [0.0, 0.002, 0.004])
+def test_a_slot_that_ends_before_the_cap_does_also_says_where_the_track_is(shorter_m: float) -> None:
+    half_m = (TRAVEL_M + BARE.cap_size_m[0]) / 2 - shorter_m
+    ends_m = (0.001 - half_m, 0.001 + half_m)
+    track = slot_shift(ends_m)
+    assert track.shift_m == pytest.approx(0.001, abs=2e-4)
+    assert track.sigma_m < 4e-4
+    hosed = slot_shift(ends_m, hose_m=(ends_m[0] - 0.013, ends_m[0] - 0.003))
+    assert hosed.shift_m == pytest.approx(0.001, abs=2e-4)
+
+
+def test_ends_that_something_may_hide_or_that_differ_do_not_move_a_track() -> None:
+    half_m = (TRAVEL_M + BARE.cap_size_m[0]) / 2 - 0.003
+    ends_m = (0.001 - half_m, 0.001 + half_m)
+    assert slot_shift(ends_m, is_open=False).shift_m == 0.0
+    assert slot_shift((ends_m[0] - 0.006, ends_m[1])).shift_m == 0.0
+    assert slot_shift(ends_m, is_placed=False).shift_m == 0.0
+
+
+@pytest.mark.parametrize("is_placed", [True, False])
+def test_what_lies_further_off_than_a_panel_is_built_is_no_end_of_the_slot_where_the_border_was_seen(
+    is_placed: bool,
+) -> None:
+    """A stripe on the plate beyond each end of the slot looks like its ends, moved by 3 mm."""
+    half_m = (TRAVEL_M + BARE.cap_size_m[0]) / 2
+    track = slot_shift((0.003 - half_m, 0.003 + half_m), is_placed=is_placed)
     assert track.shift_m == pytest.approx(0.0 if is_placed else 0.003, abs=2e-4)
     assert track.sigma_m < 0.001

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.display_face import Face, face_ink, write
 
+WINDOW_FRAME_MM = 3.0  # both sides of the frame around the window of a display
 PX_PER_MM = 4.0
 DARK, WHITE = 32.0, 232.0
 SCALES = (("bar", 0, 4), ("bar", 0, 10), ("bar", -1, 5), ("MPa", 0, 16), ("%", 0, 100), ("psi", 0, 250))
@@ -160,11 +161,12 @@ def _display(canvas: Canvas, random: np.random.Generator, x: float, y: float) ->
     back, lit = {"lcd": (150.0, 38.0), "led_red": (22.0, 165.0), "led_green": (22.0, 205.0)}[style]
     window = back + (lit - back) * np.maximum(ink, 0.1 * ghosts)
     canvas.box(x, y, w, h, 50.0)
-    size = (round((w - 3.0) * PX_PER_MM), round((h - 3.0) * PX_PER_MM))
+    size = (round((w - WINDOW_FRAME_MM) * PX_PER_MM), round((h - WINDOW_FRAME_MM) * PX_PER_MM))
     small = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
     u, v = round(x * PX_PER_MM - size[0] / 2), round(y * PX_PER_MM - size[1] / 2)
     canvas.gray[v : v + size[1], u : u + size[0]] = small
-    return {"size": [w, h], "text": text, "reading": float(text), "style": style, "min": 0, "max": 10.0**whole}
+    truth = {"size": [w, h], "text": text, "reading": float(text), "style": style, "min": 0, "max": 10.0**whole}
+    return {**truth, "face": face}
 
 
 def _toggle(canvas: Canvas, random: np.random.Generator, x: float, y: float) -> Truth:

@@ -8,7 +8,8 @@ one glare and one shadow; hard 24 degrees, three glares, one shadow, two cables,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.panel_paint import DARK, PX_PER_MM, Canvas, Truth, paint
+from benchmarks.display_face import LIT, Face, face_ink
+from benchmarks.panel_paint import DARK, PX_PER_MM, WINDOW_FRAME_MM, Canvas, Truth, paint
 from hal.arrays import Array, Image
 from perception.vision.projection import homography
 
@@ -27,6 +29,7 @@ SIZE_PX = (640, 480)
 FOCAL_PX = 830.0
 GAMMA = 2.2
 GUESS_SIGMA_PX = 2.0
+HIDDEN = 0.03  # share of what tells two numbers apart that is visible at most where cables hide it
 LEAST_VISIBLE, MOST_SATURATED = 0.855, 0.25  # visible and saturated fractions of an object that counts as readable
 
 
@@ -85,6 +88,8 @@ def draw_scene(seed: int, level: str) -> Scene:
     image, cover, bright = _taken(random, canvas.gray, px_from_mm, amount)
     for panel_object in objects:
         panel_object.update(seen(panel_object, px_from_mm, cover, bright))
+        if face := panel_object.pop("face", None):
+            panel_object["undecidable"] = _is_undecidable(face, panel_object, px_from_mm, cover)
     truth = {"level": level, "kind": "overview", "panel_mm": list(PANEL_MM), "objects": objects}
     truth["H_mm_to_px"] = px_from_mm.tolist()
     return Scene(image=image, truth=truth, taught=_taught_job(random, truth))
@@ -199,13 +204,44 @@ def seen(panel_object: Truth, px_from_mm: Array, cover: Array, bright: NDArray[n
     }  # fmt: skip
 
 
+def _is_undecidable(face: Face, panel_object: Truth, px_from_mm: Array, cover: Array) -> bool:
+    """Return whether cables hide every difference between the number of a display and another one."""
+    ink, _ = face_ink(face)
+    (x, y), (w, h) = panel_object["center_mm"], (side - WINDOW_FRAME_MM for side in panel_object["size"])
+    mm_from_face = np.array([[w / ink.shape[1], 0, x - w / 2], [0, h / ink.shape[0], y - h / 2], [0, 0, 1]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    clear = cv2.warpPerspective(1.0 - cover, px_from_mm @ mm_from_face, ink.shape[::-1], flags=flags)
+    differences = (np.abs(ink - face_ink(rival)[0]) for rival in _rivals(face))
+    return any(float((off * clear).sum()) <= HIDDEN * float(off.sum()) for off in differences)
+
+
+def _rivals(face: Face) -> Iterator[Face]:
+    """Yield the faces whose number differs in one character, or has no decimal point."""
+    for k, character in enumerate(face.text):
+        if character in LIT:
+            yield from (replace(face, text=face.text[:k] + c + face.text[k + 1 :]) for c in LIT if c != character)
+    if face.decimals:
+        yield replace(face, decimals=0)
+
+
 def _taught_job(random: np.random.Generator, truth: dict[str, Any]) -> dict[str, Any]:
     """Return the input of a reader of the taught panel: the layout, and the panel's position to about two pixels."""
     width, height = truth["panel_mm"]
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
     px = _applied(np.array(truth["H_mm_to_px"]), corners) + random.normal(0, GUESS_SIGMA_PX, (4, 2))
     guess = homography(corners, px)
-    hidden = ("reading", "state", "text", "visible", "saturated", "readable", "quad_px", "bbox_px", "center_px")
+    hidden = (
+        "reading",
+        "state",
+        "text",
+        "undecidable",
+        "visible",
+        "saturated",
+        "readable",
+        "quad_px",
+        "bbox_px",
+        "center_px",
+    )
     layout = []
     for panel_object in truth["objects"]:
         entry = {key: value for key, value in panel_object.items() if key not in hidden}

@@ -29,7 +29,10 @@ PASS = {"pointer": (0.98, 0.95, 0.85), "display": (0.95, 0.90, 0.75), "state": (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """Readable object of a drawn panel and its reading; `error` in % of full scale, 100 for a wrong text or state."""
+    """Readable object of a drawn panel and its reading; `error` in % of full scale, 100 for a wrong text or state.
+
+    `undecidable`: cables hide every difference to another number, so that a refusal is right, as in the data's README.
+    """
 
     kind: str
     truth: str
@@ -38,11 +41,12 @@ class Judged:
     answered: bool
     confidence: float
     reason: str
+    undecidable: bool
 
     @property
     def is_right(self) -> bool:
         """Whether the value is within 2 % of full scale, or the state or text is exact."""
-        return self.answered and self.error <= 2.0
+        return self.error <= 2.0 if self.answered else self.undecidable
 
 
 def read_scene(scene: Scene) -> list[Judged]:
@@ -70,6 +74,7 @@ def _judged(panel_object: dict[str, Any], answer: dict[str, Any]) -> Judged:
     return Judged(
         kind=panel_object["cls"], truth=str(panel_object[key]), given=str(answer.get(key, "")), error=error, answered=key in answer,
         confidence=float(answer.get("confidence", 0.0)), reason=answer.get("reason") or "",
+        undecidable=panel_object.get("undecidable", False),
     )  # fmt: skip
 
 

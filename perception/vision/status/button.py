@@ -13,6 +13,7 @@ from perception.vision.status.shade import cap_shades
 
 # 95 % of 179 synthetic flush caps have less than 0.062, half of the others more than 0.068.
 SHADE_HALF, SHADE_SCALE = 0.06, 0.03
+MOST_SHADE = 0.17  # 98 % of 182 raised caps in hard light have less; a dark cap whose position is wrong has more
 SPOT_HALF, SPOT_SCALE = 1.12, 0.1  # 95 % of flush caps have less than 0.96, 95 % of the others more than 1.28
 SHADE_ODDS, SPOT_ODDS = (-1.5, 3.0), (-2.5, 6.0)  # a cap whose position is wrong by a pixel has a shade, too
 # Of 230 flush caps none has more than 0.002 below, except for some synthetic ones beside glare (0.004 to 0.014).
@@ -62,7 +63,7 @@ def _by_height(patch: Patch, spec: Button | Mushroom, foot_m: float | None) -> f
 def _by_shade(patch: Patch, radius_m: float) -> float | None:
     """Return the log odds of `released` from a shadow on one side and a highlight; None if neither is visible."""
     seen = cap_shades(patch, radius_m)
-    shade = float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, *SHADE_ODDS))
+    shade = float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, *SHADE_ODDS)) if not seen.shade > MOST_SHADE else 0.0
     spot = float(np.clip((seen.spot - SPOT_HALF) / SPOT_SCALE, *SPOT_ODDS))
     below = float(np.clip((seen.below - BELOW_FROM) / BELOW_SCALE, 0.0, BELOW_ODDS))
     if np.isnan(spot):

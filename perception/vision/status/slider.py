@@ -21,6 +21,7 @@ from perception.vision.status.track import BOX_M, track_shift
 
 SLOT = 0.2  # share of the cap's width: half of the slot plus its blur
 EDGE_BOX = 0.22  # share of the cap's length; a line across its middle is farther than this from its edges
+LEAST_INSIDE = 0.8  # share of the track that must be in the image
 LEAST_OPEN = 0.4  # share of a box that must not be occluded
 SLACK = 0.12  # share of the cap's length by which a cap may differ from its nominal length
 NEXT_TO = 0.4  # share of the cap's length: tolerance for two caps sharing an edge
@@ -48,10 +49,11 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     left, right = (_profile(patch, spec.angle_rad, s, side) for side in _beside_slot(patch, spec))
     seen = float(np.mean([patch.seen(*_place(spec.angle_rad, s, np.array([o * across]))) for o in (-0.3, 0.3)]))
     u, v = patch.pixel_of(*_place(spec.angle_rad, s, np.zeros(1)))
-    if float(np.mean(sample_at(patch.inside.astype(np.uint8), u, v))) < 0.97:
+    inside = sample_at(patch.inside.astype(np.uint8), u, v)[:, 0]
+    if float(inside.mean()) < LEAST_INSIDE:
         return refused("part of the track is outside the image: move the camera", unit=spec.scale.unit)
     lean_m = _base_shift_m(patch, spec, s)  # displacement of a cap's foot from its top in the image
-    open_ = _uncovered(patch, spec, s, np.minimum(left, right), float(np.median(lean_m)))
+    open_ = inside * _uncovered(patch, spec, s, np.minimum(left, right), float(np.median(lean_m)))
     found = _best_pair(left, right, s, open_, along_m=along, lean_m=lean_m, limits_m=(lo, hi))
     noise = contrast_noise(patch)
     unseen = (
@@ -74,6 +76,7 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
             (np.log((found.rival + noise) / (found.peak + noise)), np.log(0.7), -0.12),
         ]
     )
+    confidence *= float(inside.mean())  # the cap may be in the part of the track that is outside the image
     if line_m is None or abs(line_m - found.place_m) > LINE_SURE * along:
         confidence *= NO_LINE
     sigma_m = float(np.hypot(PLACE_PX / patch.image_px_per_m, track.sigma_m))

@@ -20,7 +20,7 @@ INSIDE_M = 0.0008  # half of the strip along the slot's middle that is averaged;
 BOX_M = 0.0012  # length of the two boxes whose difference is the contrast of an end
 STEP_M = 0.0001
 REACH_M = 0.005  # search to each side of an end; more than an error of the pose
-PLACED_M = 0.0015  # largest shift where the plate's border was seen; what is further is no end of this slot
+PLACED_M = 0.002  # largest shift where the plate's border was seen; what is further is no end of this slot
 LEAST_NOISES, LEAST_SHARE = 4.0, 0.5  # least contrast of an end in sigmas of its noise, and relative to the other end
 # Largest half of the difference between the length of the slot and that of the file, and the same per length.
 UNEQUAL_M, UNEQUAL_SHARE = 0.0007, 0.005

@@ -239,8 +239,8 @@ def _speed(folder: Path) -> None:
         _best([partial(_read_one, image, view, panel_object)], READINGS_TIMED) for panel_object in panel.objects
     ]
     slowest = panel.objects[int(np.argmax(readings))]
-    _line("one taught reading (patch and reader), ms: median", [1e3 * float(np.median(readings))], (3.0,), at_most=True)
-    _line(f"  the slowest, a {slowest.kind.replace('_', ' ')}", [1e3 * max(readings)], (3.0,), at_most=True)
+    _line("one taught reading (patch and reader), ms: median", [1e3 * float(np.median(readings))], (2.0,), at_most=True)
+    _line(f"  the slowest, a {slowest.kind.replace('_', ' ')}", [1e3 * max(readings)], (2.0,), at_most=True)
     print(f"{'  the same two, blurs':52s} {np.median(readings) / blur:.3g} / {max(readings) / blur:.3g}")
 
 

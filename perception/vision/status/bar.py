@@ -22,7 +22,7 @@ def bar_contrast(
     height_m: ArrayLike | None = None,
     quantile: float = 0.3,
     flank: tuple[float, float] = FLANK,
-    beside_m: float = 0.0,
+    beside_m: ArrayLike = 0.0,
     hidden: NDArray[np.bool_] | None = None,
 ) -> Array:
     """Return the signed contrast (N,), gray levels, of a bar from the object's middle towards each angle.
@@ -38,7 +38,7 @@ def bar_contrast(
         flank: distances of the flanks from the axis, in half widths.
         hidden: (H, W) mask of occluded pixels. Occluded stations are ignored; a bar that is mostly occluded has no
             contrast.
-        beside_m: offset of the bar to the right of the line from the middle, parallel to it.
+        beside_m: offset of the bars, or (N,) of each, to the right of the line from the middle, parallel to it.
     """
     angle = np.atleast_1d(np.asarray(angles_rad, float))
     ends_z = [None, None] if height_m is None else list(np.broadcast_to(np.asarray(height_m, float), (2,)))
@@ -51,18 +51,18 @@ def bar_contrast(
     count = max(6, round(float(length.max())))
     share = np.linspace(0.0, 1.0, count)[None, :, None, None]
     offsets = np.array([*CORE, -flank[0], -flank[1], flank[0], flank[1]]) * half_width_m
-    offsets = (offsets + beside_m) * patch.px_per_m
+    offsets = (offsets + np.reshape(beside_m, (-1, 1))) * patch.px_per_m
     place = ends[0][:, None, None, :] + share * along[:, None, None, :]
-    place = place + offsets[None, None, :, None] * across[:, None, None, :]
-    shape = (len(angle) * count, len(offsets))
+    place = place + offsets[:, None, :, None] * across[:, None, None, :]
+    shape = (len(angle) * count, offsets.shape[1])
     values = sample_at(patch.gray, place[..., 0].reshape(shape), place[..., 1].reshape(shape))
-    values = values.reshape(len(angle), count, len(offsets)).astype(float)
+    values = values.reshape(len(angle), count, -1).astype(float)
     core = values[:, :, :3].mean(axis=2)
     left = core - values[:, :, 3:5].mean(axis=2)
     right = core - values[:, :, 5:7].mean(axis=2)
     if hidden is not None and hidden.any():
         lost = sample_at(hidden.astype(np.uint8), place[..., 0].reshape(shape), place[..., 1].reshape(shape)) > 0.2
-        lost = lost.reshape(len(angle), count, len(offsets))
+        lost = lost.reshape(len(angle), count, -1)
         no_core, no_left, no_right = (lost[:, :, part].any(axis=2) for part in (slice(3), slice(3, 5), slice(5, 7)))
         # If one flank is hidden, the other is used alone
         left, right = np.where(no_left, right, left), np.where(no_right, left, right)

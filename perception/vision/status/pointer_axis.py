@@ -67,7 +67,7 @@ def pointer_axis(
         top = shown.max(axis=1, initial=0.0)
         goes_under = (beside & (shown > HALF_LEVEL * top[:, None])).any(axis=1)
         if (top > 0.0).any():
-            top = np.where(goes_under | (top > NUMERAL * np.percentile(top[top > 0.0], PLAIN)), 0.0, top)
+            top = np.where(goes_under | (top > NUMERAL * _percentile(top[top > 0.0], PLAIN)), 0.0, top)
         there = top > 0.0
         if there.sum() < LEAST_ROWS:
             return np.nan, np.nan
@@ -75,6 +75,12 @@ def pointer_axis(
         mass, at = over.sum(axis=1), r[there]
         theta0, e, variance = fitted_line(at, over @ offset / mass, mass, e_sigma, 0.15 / px_per_m)
         width = mass * abs(offset[1] - offset[0]) / ((1.0 - HALF_LEVEL) * top[there])
-        half_m = OWN_WIDTH[1] * (np.percentile(width * at, OWN_WIDTH[0]) + 1.0 / px_per_m)
+        half_m = OWN_WIDTH[1] * (_percentile(width * at, OWN_WIDTH[0]) + 1.0 / px_per_m)
         near = np.abs(offset - (theta0 + e / r)[:, None]) < (half_m / r)[:, None]
     return theta0, variance
+
+
+def _percentile(values: Array, percent: float) -> float:
+    """Return `np.percentile`, which takes as long as all the rest on the few rows of a pointer."""
+    ordered = np.sort(values)
+    return float(np.interp(percent / 100.0 * (len(ordered) - 1), np.arange(len(ordered)), ordered))

@@ -32,7 +32,7 @@ def read_toggle(patch: Patch, spec: Toggle) -> PatchReading:
     noise = contrast_noise(patch)
     aside_m = _aside_m(patch, spec)
     at_foot = _at_foot(patch, spec, noise, aside_m)
-    contrast = np.array([_stretch(patch, spec, angle, BAT, aside_m) for angle in LEANS])
+    contrast = _stretches(patch, spec, BAT, aside_m)
     status = choose(STATES, np.abs(contrast), noise=noise, seen=seen, what="bat")
     if status.state is None:
         return choose(STATES, np.abs(at_foot), noise=noise, seen=seen, what="bat")
@@ -48,8 +48,7 @@ def _aside_m(patch: Patch, spec: Toggle) -> float:
 
     def stands_out(radii: float) -> float:
         aside_m = radii * spec.bat_radius_m
-        contrast = [_stretch(patch, spec, angle, BAT, aside_m) for angle in LEANS]
-        return float(np.abs(contrast).max()) * (1.0 - ASIDE_COST * abs(radii))
+        return float(np.abs(_stretches(patch, spec, BAT, aside_m)).max()) * (1.0 - ASIDE_COST * abs(radii))
 
     return spec.bat_radius_m * max(ASIDE, key=stands_out)
 
@@ -59,25 +58,23 @@ def _at_foot(patch: Patch, spec: Toggle, noise: float, aside_m: float) -> Array:
 
     Zeros unless on one side only.
     """
-    contrast = np.array([_stretch(patch, spec, angle, AT_FOOT, aside_m) for angle in LEANS])
+    contrast = _stretches(patch, spec, AT_FOOT, aside_m)
     size = np.abs(contrast)
     stands_out = size.max() > AT_FOOT_NOISE * noise and size.min() < 0.5 * size.max()
     return np.where(size == size.max(), contrast, 0.0) if stands_out else np.zeros(2)
 
 
-def _stretch(patch: Patch, spec: Toggle, angle_rad: float, along: tuple[float, float], aside_m: float) -> float:
-    """Return the signed contrast of a stretch of a bat that leans towards an angle.
+def _stretches(patch: Patch, spec: Toggle, along: tuple[float, float], aside_m: float) -> Array:
+    """Return the signed contrasts (2,) of a stretch of a bat that leans towards each of `LEANS`.
 
     `along`: shares of the bat's length; `aside_m`: see `_aside_m`.
     """
     reach, height = spec.bat_length_m * np.sin(spec.tilt_rad), spec.bat_length_m * np.cos(spec.tilt_rad)
     first, last = along
-    contrast = bar_contrast(
-        patch, angle_rad, along_m=(first * reach, last * reach), half_width_m=0.8 * spec.bat_radius_m, quantile=0.5,
-        height_m=(PIVOT_M + first * height, PIVOT_M + last * height), flank=FLANK,
-        beside_m=aside_m * float(np.cos(angle_rad)),
+    return bar_contrast(
+        patch, LEANS, along_m=(first * reach, last * reach), half_width_m=0.8 * spec.bat_radius_m, quantile=0.5,
+        height_m=(PIVOT_M + first * height, PIVOT_M + last * height), flank=FLANK, beside_m=aside_m * np.cos(LEANS),
     )  # fmt: skip
-    return float(contrast[0])
 
 
 READER = Reader[Toggle](read=read_toggle, guesses_right=0.45, leans=True)

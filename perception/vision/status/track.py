@@ -57,24 +57,22 @@ def track_shift(patch: Patch, spec: Slider, *, cap_m: float, is_open: Callable[[
     least = LEAST_NOISES * contrast_noise(patch)
     seen = max((_ends(profiles, shade, least) for shade in (1.0, -1.0)), key=_weakest)
     most_m = PLACED_M if patch.is_placed else REACH_M + BOX_M
+    unequal_m = UNEQUAL_M + UNEQUAL_SHARE * half_m
     if len(seen) == 2:
         (low_m, low_contrast), (high_m, high_contrast) = seen
         ratio = low_contrast / high_contrast
         shift_m, longer_m = (low_m + high_m) / 2, (high_m - low_m) / 2
         alike, is_near = min(ratio, 1.0 / ratio), abs(shift_m) <= most_m
-        if is_near and alike >= LEAST_SHARE and abs(longer_m) <= UNEQUAL_M + UNEQUAL_SHARE * half_m:
+        if is_near and alike >= LEAST_SHARE and abs(longer_m) <= unequal_m:
             return TrackShift(shift_m=shift_m, sigma_m=BOTH_SIGMA_M)
         is_clear = all(is_open(at) and abs(at - cap_m) > room_m for at in (low_m - half_m, high_m + half_m))
-        if (
-            is_near
-            and alike >= SHORT_SHARE
-            and is_clear
-            and patch.is_placed
-            and -spec.cap_size_m[0] / 2 <= longer_m < 0.0
-        ):
+        is_short = patch.is_placed and -spec.cap_size_m[0] / 2 <= longer_m < 0.0
+        if is_near and alike >= SHORT_SHARE and is_clear and is_short:
             return TrackShift(shift_m=shift_m, sigma_m=SHORT_SIGMA_M)
-    elif len(sides) == 1 and len(seen) == 1 and abs(seen[0][0]) <= most_m:
-        return TrackShift(shift_m=seen[0][0], sigma_m=ONE_SIGMA_M)
+    elif len(sides) == len(seen) == 1 and abs(seen[0][0]) <= most_m:
+        may_be_short = patch.is_placed and -sides[0] * seen[0][0] > unequal_m
+        if not may_be_short:
+            return TrackShift(shift_m=seen[0][0], sigma_m=ONE_SIGMA_M)
     return TrackShift(shift_m=0.0, sigma_m=MISSED_SIGMA_M if sides and not patch.is_placed else NONE_SIGMA_M)
 
 

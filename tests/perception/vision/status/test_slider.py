@@ -97,12 +97,13 @@ def slot_shift(
     is_placed: bool = True,
     hose_m: tuple[float, float] | None = None,
     is_open: bool = True,
+    cap_m: float = 0.0,
 ) -> TrackShift:
-    """Return the shift of a slot between two places, m, with a dark hose between two others; the cap is in the middle."""
+    """Return the shift of a slot between two places, m, with a dark hose between two others; the cap itself is not drawn."""
     px_per_m, half_m = 4000.0, (TRAVEL_M + BARE.cap_size_m[0]) / 2
     picture = np.full((240, round(2 * half_m * px_per_m) + 160), 150.0)
     middle = np.array([(picture.shape[1] - 1) / 2, (picture.shape[0] - 1) / 2])
-    for (low_m, high_m), gray in (((ends_m), 40.0), (hose_m or (0.0, 0.0), 20.0)):
+    for (low_m, high_m), gray in ((ends_m, 40.0), (hose_m or (0.0, 0.0), 20.0)):
         low, high = (round(middle[0] + at_m * px_per_m) for at_m in (low_m, high_m))
         picture[round(middle[1]) - 5 : round(middle[1]) + 6, low:high] = gray
     noise = np.random.default_rng(3).normal(0.0, 1.0, picture.shape)
@@ -111,7 +112,7 @@ def slot_shift(
         px_per_m=px_per_m, image_px_per_m=px_per_m / 1.5, origin_px=middle, parallax_px_per_m=np.zeros(2), growth_per_m=0.0,
         plane_z_m=0.0, is_placed=is_placed,
     )  # fmt: skip
-    return track_shift(patch, BARE, cap_m=0.0, is_open=lambda _at_m: is_open)
+    return track_shift(patch, BARE, cap_m=cap_m, is_open=lambda _at_m: is_open)
 
 
 @pytest.mark.parametrize("shorter_m", [0.0, 0.002, 0.004])
@@ -123,6 +124,16 @@ def test_a_slot_that_ends_before_the_cap_does_also_says_where_the_track_is(short
     assert track.sigma_m < 4e-4
     hosed = slot_shift(ends_m, hose_m=(ends_m[0] - 0.013, ends_m[0] - 0.003))
     assert hosed.shift_m == pytest.approx(0.001, abs=2e-4)
+
+
+def test_one_end_of_a_slot_that_may_be_shorter_does_not_move_a_track() -> None:
+    """The cap hides the other end, and where this one should be depends on the length of the slot."""
+    half_m = (TRAVEL_M + BARE.cap_size_m[0]) / 2
+    near = slot_shift((0.0005 - half_m, 0.0005 + half_m), cap_m=TRAVEL_M / 2)
+    assert near.shift_m == pytest.approx(0.0005, abs=2e-4)
+    short = slot_shift((0.0015 - half_m, half_m), cap_m=TRAVEL_M / 2)
+    assert short.shift_m == 0.0
+    assert short.sigma_m > near.sigma_m
 
 
 def test_ends_that_something_may_hide_or_that_differ_do_not_move_a_track() -> None:

@@ -63,7 +63,7 @@ def _by_height(patch: Patch, spec: Button | Mushroom, foot_m: float | None) -> f
 def _by_shade(patch: Patch, radius_m: float) -> float | None:
     """Return the log odds of `released` from a shadow on one side and a highlight; None if neither is visible."""
     seen = cap_shades(patch, radius_m)
-    shade = float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, *SHADE_ODDS)) if not seen.shade > MOST_SHADE else 0.0
+    shade = 0.0 if seen.shade > MOST_SHADE else float(np.clip((seen.shade - SHADE_HALF) / SHADE_SCALE, *SHADE_ODDS))
     spot = float(np.clip((seen.spot - SPOT_HALF) / SPOT_SCALE, *SPOT_ODDS))
     below = float(np.clip((seen.below - BELOW_FROM) / BELOW_SCALE, 0.0, BELOW_ODDS))
     if np.isnan(spot):

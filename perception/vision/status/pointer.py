@@ -194,17 +194,15 @@ def _hidden(
 def _low_mean(columns: Float32, hidden: NDArray[np.bool_], low: float, high: float) -> Array:
     """Return the mean of every column between two quantiles of the visible values; 0 if most of it is hidden."""
     if not hidden.any():
-        first = int(low * len(columns))
-        return np.asarray(
-            np.sort(columns, axis=0)[first : max(first + 2, round(high * len(columns)))].mean(axis=0, dtype=float)
-        )
+        ranks = slice(int(low * len(columns)), max(int(low * len(columns)) + 2, round(high * len(columns))))
+        return np.asarray(np.sort(columns, axis=0)[ranks].mean(axis=0, dtype=float))
     ordered = np.sort(np.where(hidden, np.inf, columns), axis=0)
     known = np.isfinite(ordered)
     count = known.sum(axis=0)
-    begin = (low * count).astype(int)
-    last = np.maximum(begin + 2, np.round(high * count).astype(int))  # at least two ranks
+    first = (low * count).astype(int)
+    last = np.maximum(first + 2, np.round(high * count).astype(int))  # at least two ranks
     rank = np.arange(len(columns))[:, None]
-    mean = np.where((rank >= begin) & (rank < last) & known, ordered, 0.0).sum(axis=0, dtype=float) / (last - begin)
+    mean = np.where((rank >= first) & (rank < last) & known, ordered, 0.0).sum(axis=0, dtype=float) / (last - first)
     return np.where(count >= 0.5 * len(columns), mean, 0.0)
 
 

@@ -80,9 +80,8 @@ def read_slider(patch: Patch, spec: Slider) -> PatchReading:
     if line_m is None or abs(line_m - found.place_m) > LINE_SURE * along:
         confidence *= NO_LINE
     sigma_m = float(np.hypot(PLACE_PX / patch.image_px_per_m, track.sigma_m))
-    near = float(
-        erf(RIGHT * spec.travel_m / sigma_m / np.sqrt(2.0))
-    )  # alone it refuses nothing: the answer says its sigma
+    # An uncertain place alone refuses nothing, because the answer states its uncertainty.
+    near = float(erf(RIGHT * spec.travel_m / sigma_m / np.sqrt(2.0)))
     status = PatchReading(
         value=spec.scale.value_at(place),
         unit=spec.scale.unit,

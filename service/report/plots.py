@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import io
 from collections.abc import Sequence
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hal.gc_freeze import freeze_loaded
 from hal.motion import MotionReport
 
 if TYPE_CHECKING:
@@ -250,8 +247,7 @@ def figure_png(figure: Figure) -> bytes:
     """Return a finished figure as PNG bytes, and empty it.
 
     Long curves are drawn in pieces, because the event loop waits while one is drawn, 50 ms for 7500 points. An emptied figure
-    keeps 1 MB in cycles of references until a full garbage collection, which would come after several reports. So those of the
-    figures before are collected here: in 1 ms, because matplotlib itself is excluded; otherwise in 10 ms.
+    keeps 1 MB until a full garbage collection, which comes after minutes; with its curves and its canvas it would keep 10 MB.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -262,12 +258,4 @@ def figure_png(figure: Figure) -> bytes:
         canvas.print_png(stream)  # type: ignore[no-untyped-call]  # matplotlib has no annotation here
     figure.clear()
     del canvas.renderer
-    gc.collect()
-    _exclude_matplotlib()
     return stream.getvalue()
-
-
-@cache
-def _exclude_matplotlib() -> None:
-    """Exclude matplotlib from garbage collection; to be called when it has drawn something, and so has loaded itself."""
-    freeze_loaded()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import re
-import weakref
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from service.commands.report import folder_of
 from service.report.blocks import Appendix, Block, Facts, Figures, Table, Text, Title
 from service.report.document import Report, blocks_of
 from service.report.pdf import pdf_of
-from service.report.plots import box_of, figure_png, png_of, sheet, thinned
+from service.report.plots import box_of, png_of, thinned
 from service.report.upright import quarter_turns, turned_image, turned_points
 from service.report.write import render
 from tests.service.browser import CHROMIUM, barriers, browser
@@ -195,27 +193,6 @@ def test_a_long_curve_is_drawn_with_all_its_peaks() -> None:
     assert (np.diff(shown_s) > 0).all()
     assert {50.0, -40.0, 30.0} <= set(shown_n)
     assert thinned(times[:9], force_n[:9])[1].tolist() == force_n[:9].tolist()
-
-
-def test_a_figure_is_freed_when_the_next_one_is_drawn() -> None:
-    """It consists of cycles of references, which a service would keep until several reports later."""
-
-    def drawn() -> weakref.ref[Any]:
-        figure = sheet(2.0)
-        pane = figure.add_subplot()
-        pane.plot([0.0, 1.0])
-        assert figure_png(figure).startswith(b"\x89PNG")
-        return weakref.ref(pane)
-
-    drawn()  # loads matplotlib, which is excluded from collection with this figure
-    gc.disable()
-    try:
-        first = drawn()
-        drawn()
-        assert first() is None
-    finally:
-        gc.enable()
-        gc.unfreeze()
 
 
 @pytest.mark.slow

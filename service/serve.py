@@ -19,6 +19,7 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 from hal.config import Cell
 from hal.errors import CellError, ConfigError
 from hal.gc_freeze import freeze_loaded
+from hal.malloc_arenas import share_one_heap
 from hal.priorities import raise_session
 from hal.process_state import COMPUTES, set_memory_priority
 from service.client import Client
@@ -190,6 +191,7 @@ class Panelwright:
         Raises:
             CellError: the cell could not start.
         """
+        share_one_heap()
         exit_on_sigterm()
         set_memory_priority(
             COMPUTES

@@ -20,6 +20,7 @@ from hal.devices import DeviceKind
 from hal.errors import CellError, ConfigError, DeviceError
 from hal.gc_freeze import freeze_loaded
 from hal.isolated import Report, isolated_device
+from hal.malloc_arenas import share_one_heap
 from hal.motion import CellSignals
 from hal.priorities import Priority, take_priority
 from hal.process_state import MOVES, set_memory_priority
@@ -276,6 +277,7 @@ def _close_all(closers: Iterable[Callable[[], None]]) -> None:
 def main() -> None:
     """Run the cell process; this is its entry point."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor handles Ctrl-C and closes the pipe when it ends
+    share_one_heap()
     sys.setswitchinterval(SWITCH_S)
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     set_memory_priority(MOVES)  # as its parent had it before it began to compute

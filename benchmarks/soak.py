@@ -2,8 +2,11 @@
 
 Under a mix: missions, readings, pictures, listeners of the stream that come and go, stops with resets, and broken requests. Or
 under chaos, which breaks something in each mission; `--same-service` leaves out the two faults that end the service, because a
-service that lives for minutes only shows no slow growth. The memory that each process has for itself (unique set size) and its
-open descriptors are sampled: every 5 s under the mix, and between the rounds of the chaos, when no task runs.
+service that lives for minutes only shows no slow growth. Memory and open descriptors are sampled at rest, when no task runs and
+nobody asks: after each mission of the mix, and between the rounds of the chaos. What a request holds while it is answered is no
+growth. The memory is what a process has allocated and touched (resident and anonymous). It leaves out the pages of library
+files, and counts a page that a process shares with the one that forked it. Otherwise a figure would change because another
+process begins to use the same library, or writes to a page that both had.
 
 After the first minutes, in which libraries and kernels load, the memory may grow by 5 MB and the descriptors not at all. A process
 that has just begun has loaded less than one that has worked, and chaos replaces processes all the time. So like is compared with
@@ -19,8 +22,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -33,7 +37,7 @@ from websockets.sync.client import connect
 from benchmarks.kills import chaos_on
 from hal.arrays import Array
 from hal.errors import CellError
-from service.chaos.family import roles_of
+from service.chaos.family import PROC, roles_of
 from service.chaos.faults import FAULTS
 from service.chaos.options import ChaosOptions
 from service.chaos.plant import Plant, serve_command
@@ -41,7 +45,7 @@ from service.client import FINAL, ApiError
 
 CELL = Path(__file__).resolve().parents[1] / "cells/bench.toml"
 START_S = 400.0
-EVERY_S = 5.0
+WORK_EVERY_S = 0.2
 STOP_EVERY_S = 180.0  # so that missions also come to their ends and write their reports
 PASS_MB = 5.0
 WINDOW = 0.2  # of the samples: the medians of the first and the last ones are compared
@@ -55,7 +59,7 @@ class Sample(NamedTuple):
 
     Attributes:
         worked: number of rounds since the process began; 0 under the mix.
-        memory_mb: its unique set size.
+        memory_mb: what it has allocated and touched.
         descriptors: number of open ones.
     """
 
@@ -66,6 +70,7 @@ class Sample(NamedTuple):
 
 Samples = dict[str, list[Sample]]
 """The looks at the process of each role, in the order of time."""
+Work = Callable[[Plant], None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,20 +107,75 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _mixed(plant: Plant, minutes: float, settle: float) -> tuple[Samples, int]:
     """Return the samples under the mix, in which nothing is judged."""
-    end = threading.Event()
-    done = [0] * len(MIX)
+    rows: Samples = {role: [] for role in ROLES}
+    mix = _Mix(plant)
     try:
         plant.start()
         plant.await_ready(START_S)
-        for number in range(len(MIX)):
-            threading.Thread(target=_repeat, args=(number, plant, end, done), daemon=True).start()
-        samples = _sampled(plant, end, minutes=minutes, settle=settle)
+        for work, every_s in BESIDES:
+            threading.Thread(target=mix.repeat, args=(work, every_s), daemon=True).start()
+        begun_s = time.monotonic()
+        while (passed_s := time.monotonic() - begun_s) < 60.0 * minutes:
+            mix.do(_mission)
+            with mix.at_rest():
+                time.sleep(REST_S)
+                for role, process in roles_of(plant.pid).items() if passed_s >= 60.0 * settle else ():
+                    _add(rows[role], process.pid, worked=0)
     finally:
-        end.set()
+        mix.end.set()
         plant.end()
         plant.sweep()
-    print(", ".join(f"{count} x {work.__name__[1:]}" for work, count in zip(MIX, done, strict=True)))
-    return samples, 0
+    print(", ".join(f"{count} x {name[1:]}" for name, count in mix.done.items()))
+    return rows, 0
+
+
+class _Mix:
+    """Works beside one another on one service, which can be made to rest.
+
+    Attributes:
+        end: set when no more work may begin.
+        done: how often each work was done, by its name.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.end = threading.Event()
+        self.done: Counter[str] = Counter()
+        self._plant = plant
+        self._changed = threading.Condition()
+        self._working = 0
+        self._rests = False
+
+    def repeat(self, work: Work, every_s: float) -> None:
+        """Do a work again and again until the end, and not while the service rests."""
+        while not self.end.wait(every_s):
+            with self._changed:
+                self._changed.wait_for(lambda: not self._rests)
+                self._working += 1
+            try:
+                self.do(work)
+            finally:
+                with self._changed:
+                    self._working -= 1
+                    self._changed.notify_all()
+
+    def do(self, work: Work) -> None:
+        """Do a work once; it counts when it succeeds."""
+        with suppress(CellError, OSError, WebSocketException):
+            work(self._plant)
+            self.done[work.__name__] += 1
+
+    @contextmanager
+    def at_rest(self) -> Iterator[None]:
+        """Wait until no repeated work is under way, and let none begin in the context."""
+        with self._changed:
+            self._rests = True
+            self._changed.wait_for(lambda: self._working == 0)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._rests = False
+                self._changed.notify_all()
 
 
 def _broken(seed: int, same_service: bool, plant: Plant, minutes: float, settle: float) -> tuple[Samples, int]:
@@ -139,20 +199,15 @@ def _broken(seed: int, same_service: bool, plant: Plant, minutes: float, settle:
     return rows, len(breaches)
 
 
-def _sampled(plant: Plant, end: threading.Event, *, minutes: float, settle: float) -> Samples:
-    """Return the samples of the time after that to settle."""
-    begun_s = time.monotonic()
-    rows: Samples = {role: [] for role in ROLES}
-    while (passed_s := time.monotonic() - begun_s) < 60.0 * minutes and not end.wait(EVERY_S):
-        for role, process in roles_of(plant.pid).items() if passed_s >= 60.0 * settle else ():
-            _add(rows[role], process.pid, worked=0)
-    return rows
-
-
 def _add(rows: list[Sample], pid: int, *, worked: int) -> None:
-    with suppress(psutil.Error):
+    with suppress(psutil.Error, OSError, StopIteration):  # it ends at this moment
         one = psutil.Process(pid)
-        rows.append(Sample(worked, one.memory_full_info().uss / 1e6, float(one.num_fds())))
+        rows.append(Sample(worked, _allocated_mb(pid), float(one.num_fds())))
+
+
+def _allocated_mb(pid: int) -> float:
+    status = (PROC / str(pid) / "status").read_text(encoding="ascii", errors="replace")
+    return next(int(line.split()[1]) * 1024e-6 for line in status.splitlines() if line.startswith("RssAnon:"))
 
 
 def _without_levels(rows: Sequence[Sample]) -> Array:
@@ -162,13 +217,6 @@ def _without_levels(rows: Sequence[Sample]) -> Array:
     for count in np.unique(worked):
         values[worked == count] -= np.median(values[worked == count], axis=0)
     return values
-
-
-def _repeat(number: int, plant: Plant, end: threading.Event, done: list[int]) -> None:
-    while not end.wait(0.2):
-        with suppress(CellError, OSError, WebSocketException):
-            MIX[number](plant)
-            done[number] += 1
 
 
 def _mission(plant: Plant) -> None:
@@ -189,7 +237,6 @@ def _listener(plant: Plant) -> None:
 
 
 def _stop(plant: Plant) -> None:
-    time.sleep(STOP_EVERY_S)
     count = plant.stop_client().post("/v1/stop")["count"]
     time.sleep(1.0)
     plant.client().post("/v1/stop/reset", {"seen_count": count})
@@ -200,7 +247,13 @@ def _nonsense(plant: Plant) -> None:
         plant.client().post("/v1/missions", {"file": 5})
 
 
-MIX: tuple[Callable[[Plant], None], ...] = (_mission, _reading, _listener, _stop, _nonsense)
+BESIDES: tuple[tuple[Work, float], ...] = (
+    (_reading, WORK_EVERY_S),
+    (_listener, WORK_EVERY_S),
+    (_stop, STOP_EVERY_S),
+    (_nonsense, WORK_EVERY_S),
+)
+"""What is done beside the missions, and the pause before each."""
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import Any
 
 from hal.simulated import TrueContact
 
-BLOCKS = 4500  # as long as the states of the objects are kept: 15 minutes in blocks of 0.2 s
+BLOCKS = 4500  # as many as states of the objects are kept: 15 minutes of contact in blocks of 0.2 s
 
 
 @dataclass(slots=True, eq=False)
@@ -92,9 +92,10 @@ class ContactLog:
         self.peak_n = max(self.peak_n, now_n)
 
     def end_block(self, tick: int) -> None:
-        """Keep the forces of the ticks up to this one, and begin the next block."""
-        self._past.append((tick, self._block))
-        self._block = _Block()
+        """Keep the forces of the ticks up to this one, if there were any, and begin the next block."""
+        if self._block.peaks_n:
+            self._past.append((tick, self._block))
+            self._block = _Block()
 
     def since(self, time_s: float) -> TrueContact:
         """Return the forces since a time, from the beginning of the block in which it lies."""

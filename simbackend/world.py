@@ -43,7 +43,7 @@ ARM_GAIN, FINGER_GAIN = 0.45, 0.6  # fraction of a joint's error that its motor 
 CONE_RAYS = 4
 CONE_RAD = 0.0175
 CONE_DEPTH_M = 0.02
-PAST_TICKS, PAST_KEPT = 100, 4500  # past object states for the judge: at 500 Hz every 0.2 s for 15 minutes
+PAST_TICKS, PAST_KEPT = 100, 4500  # past object states for the judge: at 500 Hz every 0.2 s for 15 minutes of change
 
 
 class World:
@@ -208,8 +208,15 @@ class World:
         self._read_joints()
         self._read_contacts()
         if self.tick % PAST_TICKS == 0:
-            self._past.append((self.tick, self.panel.truth()))
+            self._remember()
             self._forces_on.end_block(self.tick)
+
+    def _remember(self) -> None:
+        """Keep the states of the objects if one has changed, and of each one that has not the state that is kept already."""
+        last = self._past[-1][1] if self._past else self.initial
+        now = tuple(old if old == new else new for old, new in zip(last, self.panel.truth(), strict=True))
+        if now != last:
+            self._past.append((self.tick, now))
 
     def _read_joints(self) -> None:
         engine = self.engine

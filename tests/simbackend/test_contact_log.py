@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from simbackend.contact_log import ContactLog, contacts_of
+from simbackend.contact_log import BLOCKS, ContactLog, contacts_of
 from simbackend.urdf import at, box, inertial, joint, link, shape
 from simbackend.world import _quiet_pybullet
 
@@ -52,6 +52,16 @@ def test_blocks_before_the_time_asked_for_do_not_count(log: ContactLog) -> None:
     assert log.since(0.0).peaks_n == {"lever": 80.0, "knob": 20.0}
     assert log.since(0.4).peak_n == 5.0
     assert log.peak_n == 80.0
+
+
+def test_time_without_contact_does_not_drive_out_the_contacts(log: ContactLog) -> None:
+    log.note([point(3, 80.0)])
+    log.end_block(100)
+    for block in range(2 * BLOCKS):
+        log.nothing()
+        log.end_block(100 * (block + 2))
+    assert log.since(0.0).peaks_n == {"lever": 80.0}
+    assert log.since(0.2).peak_n == 0.0
 
 
 def test_without_contact_all_is_zero(log: ContactLog) -> None:

@@ -12,6 +12,9 @@ import pytest
 from hal.config import load_cell
 from hal.errors import ConfigError, InvalidRequest
 from hal.simulated import ShowsValues
+from simbackend import world as world_module
+from simbackend.wire import WorldConfig
+from simbackend.world import PAST_TICKS, World
 from tests.simbackend.rig import ROOT, SimCell, sim_cell
 
 
@@ -51,6 +54,34 @@ def test_the_picture_changes_with_the_value_and_back(cell: SimCell, name: str, v
     first, other, again = picture(values[0]), picture(values[1]), picture(values[0])
     assert np.abs(other - first).max() > 25.0
     assert np.abs(again - first).max() < 25.0  # noise only
+
+
+def test_the_states_of_a_time_are_known_though_nothing_has_changed_since(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(world_module, "PAST_KEPT", 2)
+    bench = load_cell(ROOT / "cells/bench.toml", seed=11)
+    world = World(WorldConfig(cell=bench, model="t3", proximity=(), proximity_range_m=0.3))
+    number = next(i for i, one in enumerate(bench.panel.objects) if one.name == "pressure")
+
+    def advance(steps: int) -> float:
+        """Advance by so many steps at which states are kept; return the time."""
+        for _ in range(PAST_TICKS * steps):
+            world._advance()
+        return world.tick * world.dt_s
+
+    def pressure(time_s: float) -> float:
+        return next(one.value for one in world.truth(time_s).initial if one.name == "pressure")
+
+    try:
+        built = pressure(0.0)
+        world.show(number, 2.5)
+        first_s = advance(1)
+        later_s = advance(5)
+        world.show(number, 7.5)
+        last_s = advance(1)
+        assert built not in (2.5, 7.5)
+        assert [pressure(at_s) for at_s in (0.0, first_s, later_s, last_s)] == pytest.approx([built, 2.5, 2.5, 7.5])
+    finally:
+        world.close()
 
 
 def test_what_shows_no_value_of_a_process_is_refused(cell: SimCell) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import threading
 import time
@@ -110,7 +111,6 @@ class Task:
     goes_on: threading.Event = field(default_factory=set_event)
     is_held: bool = False
     state: TaskState = TaskState.QUEUED
-    result: Any = None
     problem: ProblemFields | None = None
     artefacts: list[Artefact] = field(default_factory=list)
     events: list[TaskEvent] = field(default_factory=list)
@@ -122,6 +122,19 @@ class Task:
     on_change: Callable[[Task], None] | None = None
     _condition: threading.Condition = field(default_factory=threading.Condition)
     _sequence: int = 0
+    _result_json: bytes = b"null"
+
+    @property
+    def result(self) -> Any:
+        """What the work returned, as plain JSON values; a new copy at each call.
+
+        It is kept as text, because the values of a mission take 50 kB and their text 10 kB, and 200 tasks are kept.
+        """
+        return json.loads(self._result_json)
+
+    @result.setter
+    def result(self, value: Any) -> None:
+        self._result_json = json.dumps(value, separators=(",", ":")).encode()
 
     @property
     def fraction(self) -> float:

@@ -63,8 +63,10 @@ def _until_cancelled(context: TaskContext) -> None:
 
 
 def test_success_carries_the_result(bench: Bench) -> None:
-    task = bench.run(lambda _: {"answer": 42})
-    assert (task.state, task.result, task.fraction) == (S.SUCCEEDED, {"answer": 42}, 1.0)
+    answer = {"pose": [0.1 + 0.2, -1e-17, 3], "name": "Füllstand", "none": None, "deep": {"list": [True, []]}}
+    task = bench.run(lambda _: answer)
+    task.result["deep"]["list"].append("a reader's copy")
+    assert (task.state, task.result, task.fraction) == (S.SUCCEEDED, answer, 1.0)
 
 
 def test_a_full_disk_is_no_defect_of_ours(bench: Bench) -> None:

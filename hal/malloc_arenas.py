@@ -1,4 +1,4 @@
-"""Limits the heaps among which the C library divides what a process allocates."""
+"""Keeps a process from holding memory that it does not use: one heap of the C library, and what is free goes back."""
 
 from __future__ import annotations
 
@@ -18,3 +18,15 @@ def share_one_heap() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
+
+
+def return_free_memory() -> None:
+    """Give the memory that the heap does not use back to the operating system; to be called after large work.
+
+    By itself glibc gives back what is free at the end of the heap only, and keeps twice the size of the largest block that was
+    freed. Between its missions the service of the bench cell so held 20 to 50 MB beside the 195 MB that it used. Other threads
+    that need memory wait meanwhile, for some milliseconds. Where the C library cannot do it, this does nothing.
+    """
+    malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if malloc_trim is not None:
+        malloc_trim(0)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from hal.errors import Cancelled, CellError, InvalidRequest
+from hal.malloc_arenas import return_free_memory
 from hal.priorities import Priority, take_priority
 from service.access.actor import actor
 from service.errors import Aborted, Busy, Defect, NoSuchTask, NotPossibleNow, of_file
@@ -115,7 +116,9 @@ class TaskStore:
                 self._tasks.pop(task.id, None)
             raise
         task.add_event("state")
-        self._lanes[moves].submit(self._run, task, work)
+        running = self._lanes[moves].submit(self._run, task, work)
+        if moves:  # it took seconds and handled images; tasks that only read may follow each other fast
+            running.add_done_callback(lambda _: return_free_memory())
         return task
 
     def has_key(self, key: str) -> bool:

@@ -1,4 +1,4 @@
-"""All threads of a process allocate from its one heap."""
+"""All threads of a process allocate from its one heap, and what is free in it goes back to the operating system."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 
 from hal import malloc_arenas
 
+IS_GLIBC = hasattr(ctypes.CDLL(None), "gnu_get_libc_version")
 ALLOCATES = """
 import ctypes
 from concurrent.futures import ThreadPoolExecutor
@@ -26,8 +27,29 @@ first, last = (int(end, 16) for end in line.split()[0].split("-"))
 print(sum(first <= address < last for address in addresses))
 """
 
+FREES = """
+import ctypes
+import psutil
+from hal.malloc_arenas import return_free_memory
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "gnu_get_libc_version"), reason="the C library is not glibc")
+BLOCK, COUNT = 100_000, 400
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
+def held_mb():
+    return psutil.Process().memory_info().rss / 1e6
+before = held_mb()
+blocks = [libc.malloc(BLOCK) for _ in range(COUNT)]
+for block in blocks:
+    ctypes.memset(block, 1, BLOCK)
+for block in blocks[:-1]:  # the last one keeps the heap from being cut
+    libc.free(block)
+freed = held_mb() - before
+return_free_memory()
+print(freed, held_mb() - before)
+"""
+
+
+@pytest.mark.skipif(not IS_GLIBC, reason="the C library is not glibc")
 @pytest.mark.parametrize(("call", "in_the_heap"), [("share_one_heap()", "20"), ("", "0")])
 def test_another_thread_allocates_from_the_one_heap(call: str, in_the_heap: str) -> None:
     program = ALLOCATES.format(call=call)
@@ -35,6 +57,15 @@ def test_another_thread_allocates_from_the_one_heap(call: str, in_the_heap: str)
     assert told.stdout.strip() == in_the_heap
 
 
-def test_a_c_library_without_the_limit_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.skipif(not IS_GLIBC, reason="the C library is not glibc")
+def test_memory_that_is_free_below_a_used_block_is_returned() -> None:
+    told = subprocess.run([sys.executable, "-c", FREES], capture_output=True, text=True, check=True, timeout=60)
+    freed_mb, returned_mb = (float(number) for number in told.stdout.split())
+    assert freed_mb > 35.0
+    assert returned_mb < 5.0
+
+
+def test_a_c_library_without_these_functions_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(malloc_arenas.ctypes, "CDLL", lambda _name: object())
     malloc_arenas.share_one_heap()
+    malloc_arenas.return_free_memory()

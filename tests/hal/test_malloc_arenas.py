@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import subprocess
 import sys
+import weakref
 
 import pytest
 
@@ -55,6 +56,19 @@ def test_another_thread_allocates_from_the_one_heap(call: str, in_the_heap: str)
     program = ALLOCATES.format(call=call)
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert told.stdout.strip() == in_the_heap
+
+
+def test_garbage_in_cycles_is_collected() -> None:
+    class Owner:
+        own: Owner
+
+    owner = Owner()
+    owner.own = owner
+    garbage = weakref.ref(owner)
+    del owner
+    assert garbage() is not None
+    malloc_arenas.return_free_memory()
+    assert garbage() is None
 
 
 @pytest.mark.skipif(not IS_GLIBC, reason="the C library is not glibc")

@@ -91,7 +91,7 @@ def _seen_there(ground: Ground, view: PlateProjection, truth: list[dict[str, Any
     on_plate = pixels @ np.linalg.inv(view.px_from_plate).T
     xy = on_plate[:, :2] / on_plate[:, 2:]
     middles = np.column_stack([xy[:, 0] + PLATE_M[0] / 2, PLATE_M[1] / 2 - xy[:, 1]]) * PLATE_PX_PER_M
-    places = candidate_places(ground.edges)
+    places = candidate_places(ground)
     looks, object_looks = look_at(ground, places), look_at(ground, middles)
     return {"truth": truth, "places": places, "looks": looks, "middles": middles, "object_looks": object_looks}
 

@@ -41,7 +41,7 @@ def _find_objects(picture: NDArray[np.uint8]) -> None:
     grow_regions(picture)
     view = one_plate(bright_plate(), PLATE_M).view
     ground = lay_out(bright_plate(), view, PLATE_M)
-    places = candidate_places(ground.edges)
+    places = candidate_places(ground)
     chosen(ground, places, look_at(ground, places), load_knowledge(), view, PLATE_M)
     banded = np.full((320, 480), 200, np.uint8)
     banded[:, 236:244] = 20  # a cable from top to bottom

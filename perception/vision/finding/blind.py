@@ -60,6 +60,10 @@ SIDES_M = (0.016, 0.095)
 SLOT_M = (0.034, 0.085)
 OVERLAP = 0.475  # objects overlap if their middles are closer than this share of the larger one's size
 SAME_PX = 1.5  # candidates closer than this are one
+# How much nearer a place in the middle of a rectangle counts to the kinds whose width and height differ from the rectangle's by
+# less than this logarithm. On drawings by another hand in medium light recall is .952 in place of .921; precision does not fall.
+FRAMED_NEARER, FRAME_FITS, FRAME_COVERAGE = 0.15, 0.3, 0.7
+SQUARE = 0.15  # logarithm of width over height of a kind that is about as wide as it is high
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,7 +119,7 @@ def recognise(
         plate = one_plate(gray, plate_m, focal_px=focal_px)
         view, is_sure = plate.view, plate.is_sure
     ground = lay_out(gray, view, plate_m)
-    places = candidate_places(ground.edges)
+    places = candidate_places(ground)
     found = chosen(ground, places, look_at(ground, places), knowledge, view, plate_m) if len(places) else ()
     if not is_sure and sum(c.confidence >= SURE for c in found) < LEAST_SURE:
         raise NotFound(
@@ -154,7 +158,7 @@ def uprightness(
 
 
 def lay_out(gray: Image, view: PanelProjection, plate_m: tuple[float, float]) -> Ground:
-    """Rectify the plate to a frontal view, remove cables, and find its edges."""
+    """Rectify the plate to a frontal view, remove cables, and find its edges, rectangles and slots."""
     w, h = plate_m
     size = (round(w * PLATE_PX_PER_M), round(h * PLATE_PX_PER_M))
     corners = np.array([[-w / 2, h / 2, 0], [w / 2, h / 2, 0], [w / 2, -h / 2, 0], [-w / 2, -h / 2, 0]])
@@ -163,22 +167,24 @@ def lay_out(gray: Image, view: PanelProjection, plate_m: tuple[float, float]) ->
     picture = np.asarray(cv2.warpPerspective(gray, turn, size, flags=cv2.INTER_LINEAR), np.uint8)
     level = plate_gray(picture)
     picture = without_cables(picture, level)
+    edges, s = find_edges(picture), PLATE_PX_PER_M
+    maps = direction_maps(edges)
     return Ground(
         picture=picture.astype(np.float32),
-        edges=find_edges(picture),
+        edges=edges,
         plate_gray=level,
         noisy=noise_sigma(gray) > NOISY,
+        rectangles=tuple(find_rectangles(maps, least_px=SIDES_M[0] * s, most_px=SIDES_M[1] * s)),
+        slots=tuple(find_slots(maps, least_px=SLOT_M[0] * s, most_px=SLOT_M[1] * s)),
     )
 
 
-def candidate_places(edges: Edges) -> Array:
+def candidate_places(ground: Ground) -> Array:
     """Return the middles (N, 2) of sub-objects on the rectified plate, px."""
-    s = PLATE_PX_PER_M
-    maps = direction_maps(edges)
+    edges, s = ground.edges, PLATE_PX_PER_M
     places = [(c.u, c.v) for c in find_circles(edges, least_px=CIRCLE_RADII_M[0] * s, most_px=CIRCLE_RADII_M[1] * s)]
-    places += [(r.u, r.v) for r in find_rectangles(maps, least_px=SIDES_M[0] * s, most_px=SIDES_M[1] * s)]
-    places += find_slots(maps, least_px=SLOT_M[0] * s, most_px=SLOT_M[1] * s)
-    places += _groups(edges)
+    places += [(r.u, r.v) for r in ground.rectangles]
+    places += [*ground.slots, *_groups(edges)]
     found = np.array(places, float).reshape(-1, 2)
     return found[distinct(found, np.full(2, SAME_PX))]
 
@@ -210,13 +216,11 @@ def chosen(
     knowledge = knowledge.for_image(noisy=ground.noisy)
     known = prepared(knowledge)
     mean_of = NOISY_MEAN_OF if ground.noisy else 1
-    distance = nearest(looks, known, mean_of=mean_of)
     names = [kind.name for kind in knowledge.kinds]
     nothing = nothing_column(knowledge)
-    to_nothing = distance[:, nothing] if nothing is not None else np.full(len(places), np.inf)
-    kinds = distance.copy()
-    if nothing is not None:
-        kinds[:, nothing] = np.inf
+    closer = _framed(ground, places, knowledge)
+    kinds, to_nothing = _parted(nearest(looks, known, mean_of=mean_of), nothing)
+    kinds -= closer
     best = kinds.argmin(axis=1)
     near = kinds.min(axis=1)
     size_m = np.array([max(kind.size_m) if kind.middles_m is None else 0.0 for kind in knowledge.kinds])
@@ -231,13 +235,11 @@ def chosen(
             break
         at = _centred(ground, places[now], known, best[now])
         seen_looks = look_at(ground, at)
-        for i, place, look, seen in zip(now, at, seen_looks, nearest(seen_looks, known, mean_of=mean_of), strict=True):
+        parted = _parted(nearest(seen_looks, known, mean_of=mean_of), nothing)
+        for i, place, look, seen, to_other in zip(now, at, seen_looks, *parted, strict=True):
             if _is_taken(spaces[i], taken):
                 continue
-            to_other = float(seen[nothing]) if nothing is not None else np.inf
-            if nothing is not None:
-                seen[nothing] = np.inf
-            kind = knowledge.kinds[int(seen.argmin())]
+            kind = knowledge.kinds[int((seen - closer[i]).argmin())]
             middle, size = place, max(kind.size_m) * PLATE_PX_PER_M
             if kind.middles_m is not None:
                 across, up = kind.middles_m[nearest_look(look, kind, knowledge)]
@@ -245,13 +247,39 @@ def chosen(
                 if _is_taken((*middle.tolist(), size), taken):
                     continue
             even = NOISY_EVEN if ground.noisy else EVEN
-            candidate = _candidate(place, middle, names, seen, to_other, kind.size_m, view, plate_m, even=even)
+            candidate = _candidate(
+                place, middle, names, seen, float(to_other), kind.size_m, view, plate_m, closer=closer[i], even=even
+            )
             if candidate.reason is None:
                 taken.append((*middle.tolist(), size))
                 accepted.append(candidate)
             else:
                 refused.append(candidate)
     return (*accepted, *refused)
+
+
+def _parted(distance: Array, nothing: int | None) -> tuple[Array, Array]:
+    """Return the distances (N, kinds) to the kinds, infinite to "nothing" (a column), and those (N,) to "nothing"."""
+    if nothing is None:
+        return distance, np.full(len(distance), np.inf)
+    to_nothing = distance[:, nothing].copy()
+    distance[:, nothing] = np.inf
+    return distance, to_nothing
+
+
+def _framed(ground: Ground, places: Array, knowledge: Knowledge) -> Array:
+    """Return how much nearer (N, kinds) places count to kinds of whose size they are the middle of a rectangle.
+
+    For a kind that is about as wide as it is high a rectangle proves nothing, because most of these are round.
+    """
+    sizes_px = np.array([kind.size_m for kind in knowledge.kinds]) * PLATE_PX_PER_M
+    is_long = np.abs(np.log(sizes_px[:, 0] / sizes_px[:, 1])) > SQUARE
+    closer = np.zeros((len(places), len(sizes_px)))
+    for one in ground.rectangles:
+        fits = is_long & (np.abs(np.log(sizes_px / [one.width, one.height])) < FRAME_FITS).all(axis=1)
+        if one.coverage >= FRAME_COVERAGE and fits.any():
+            closer[np.ix_((np.abs(places - [one.u, one.v]) < SAME_PX).all(axis=1), fits)] = FRAMED_NEARER
+    return closer
 
 
 def _apart(spaces: Sequence[Space], waiting: Sequence[int], taken: Sequence[Space]) -> tuple[list[int], list[int]]:
@@ -308,20 +336,22 @@ def _centred(ground: Ground, places: Array, known: Prepared, kinds: NDArray[np.i
 
 def _candidate(
     place: Array, middle: Array, names: list[str], kinds: Array, to_nothing: float, size: tuple[float, float],
-    view: PanelProjection, plate_m: tuple[float, float], *, even: float,
+    view: PanelProjection, plate_m: tuple[float, float], *, closer: Array, even: float,
 ) -> Detection:  # fmt: skip
     """Build the detection for a place from the distances to all kinds.
 
     Args:
         place, middle: (2,) place with that look, and the object's middle, pixels of the rectified plate.
         kinds, to_nothing: distances to the kinds `names`, and to "nothing".
+        closer: how much nearer it counts to each kind; see `_framed`.
         even: lead at which the confidence is one half.
     """
-    order = np.argsort(kinds)
+    counted = kinds - closer
+    order = np.argsort(counted)
     first, second = int(order[0]), int(order[min(1, len(order) - 1)])
-    to_second = float(kinds[second]) if second != first else np.inf
+    to_second = float(counted[second]) if second != first else np.inf
     rival, to_rival = (names[second], to_second) if to_second < to_nothing else (NOTHING, to_nothing)
-    lead = to_rival - float(kinds[first])
+    lead = to_rival - float(counted[first])
     confidence = float(1.0 / (1.0 + np.exp(-np.clip((lead - even) / SCALE, -8.0, 8.0))))
     if kinds[first] > ALIKE:
         confidence = min(confidence, UNLIKE_AT_MOST)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hal.arrays import Array, Image
-from perception.vision.finding.shapes import Edges
+from perception.vision.finding.shapes import Edges, Rectangle
 from perception.vision.look import AROUND_GROUPS, DIRECTIONS, GROUPS, LENGTH, RADII_M, RINGS
 from perception.vision.patch import sample_at
 
@@ -35,12 +35,14 @@ EDGE_GAIN = 40.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ground:
-    """The rectified plate, its edges, the gray that it would have without objects, and whether the image is `noisy`."""
+    """The rectified plate, its edges and gray without objects, whether it is noisy, its rectangles and slots' middles."""
 
     picture: NDArray[np.float32]
     edges: Edges
     plate_gray: NDArray[np.float32]
     noisy: bool = False
+    rectangles: tuple[Rectangle, ...] = ()
+    slots: tuple[tuple[float, float], ...] = ()
 
 
 def plate_gray(picture: Image) -> NDArray[np.float32]:

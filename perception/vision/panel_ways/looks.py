@@ -80,7 +80,7 @@ def _recognised(
     area_m = (panel.width_m + slack_m, panel.height_m + slack_m)
     view = CameraProjection(intrinsics=intrinsics, camera_from_panel=certain(prior.camera_from_panel))
     ground = lay_out(gray, view, area_m)
-    places = candidate_places(ground.edges)
+    places = candidate_places(ground)
     looks = chosen(ground, places, look_at(ground, places), knowledge, view, area_m) if len(places) else ()
     seen = [one for one in looks if one.reason is None]
     pairs = _matched(seen, panel)

@@ -100,7 +100,7 @@ def teach_from_panel(
     registered = register(gray, view, panel).view
     readings = inspect_view(image, gray, registered, panel)
     _check_most_are_there(readings, panel)
-    places = candidate_places(overview.ground.edges)
+    places = candidate_places(overview.ground)
     shown, left_out = _objects(overview, registered, panel, readings, places)
     if not shown:
         raise NotFound(

@@ -121,8 +121,7 @@ def teach(
 
     Args:
         clicks_px: one click in the middle; two on opposite corners; or three, two corners and the middle, if that is
-        not
-            half way between them.
+            not half way between them.
         size_m: width and height on the plate; by default those of the kind, or of the outline found.
         source: a remark for the knowledge file.
 
@@ -198,7 +197,7 @@ def example_at(overview: Overview, clicks_px: Sequence[tuple[float, float]], *, 
     clicks = overview.on_ground(clicks_m)
     outline = outline_at(overview.ground, clicks) if kind != NOTHING else None
     middle = clicks[0] if len(clicks) == 1 else clicks[:2].mean(axis=0) if len(clicks) == 2 else clicks[2]
-    place = snapped(middle, candidate_places(overview.ground.edges), SNAP_M * PLATE_PX_PER_M)
+    place = snapped(middle, candidate_places(overview.ground), SNAP_M * PLATE_PX_PER_M)
     empty = np.zeros((0, 2))
     outline_px = overview.in_image(overview.on_plate(outline.polygon_px)) if outline is not None else empty
     return Example(
@@ -254,7 +253,7 @@ def likest(overview: Overview, example: Example, knowledge: Knowledge) -> Detect
 
     None if it is unlike everything taught.
     """
-    places = candidate_places(overview.ground.edges)
+    places = candidate_places(overview.ground)
     middle = overview.on_ground(example.centre_m[None])[0]
     if example.outline is not None:
         places = np.vstack([places, middle, example.outline.middle_px])
@@ -311,10 +310,7 @@ def plate_points(view: PanelProjection, clicks_px: ArrayLike, plate_m: tuple[flo
 
 
 def under_pixels(view: PanelProjection, pixels: ArrayLike, plate_m: tuple[float, float]) -> Array:
-    """Return the points (N, 2.
-
-    M, origin in the plate's middle, y up) of the plate's plane at pixels, also beyond the plate.
-    """
+    """Return the points (N, 2; m, origin in the plate's middle, y up) of its plane at pixels, also beyond the plate."""
     w, h = plate_m[0] / 2, plate_m[1] / 2
     corners = np.array([[-w, h], [w, h], [w, -h], [-w, -h]])
     plate_from_px = homography(view.project(np.column_stack([corners, np.zeros(4)])), corners)

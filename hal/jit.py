@@ -19,6 +19,7 @@ from typing import Any, TypeVar, cast, overload
 import numba
 import numpy as np
 from numba.core import event
+from numba.core.registry import cpu_target
 from numba.extending import register_jitable
 
 from hal import kernel_cache, pauses
@@ -89,6 +90,12 @@ def inlined(function: F | None = None, /, *, early: bool = False) -> F | Callabl
         return register_jitable(error_model="numpy", nogil=True, inline=inline)(helper)
 
     return register if function is None else register(function)
+
+
+def load_builtins() -> None:
+    """Load what compiled functions may call, which otherwise the first call of one of them does; it takes a third of a second."""
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
 
 
 def as_numpy_scalar(value: T) -> T:

@@ -281,8 +281,9 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_S)
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="cell: %(levelname)s %(name)s: %(message)s")
     set_memory_priority(MOVES)  # as its parent had it before it began to compute
-    import hal.jit  # noqa: F401 - the simulated world needs it too, and takes it from here
+    from hal.jit import load_builtins
 
+    load_builtins()  # the simulated world needs them too, and takes them from here
     keep_spare()  # before any thread begins
     lifeline = Lifeline()
     _in_background(_import_control)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -11,7 +11,9 @@ from rich.markup import escape
 from service.client import Client
 from service.commands.common import DEFAULT_CELL, CellOption, SeedOption, console
 from service.commands.own_cell import ServiceUrl, run_on_cell, run_task
-from service.schema.results import LearnResult
+
+if TYPE_CHECKING:
+    from service.schema.results import LearnResult
 
 
 def learn(
@@ -31,6 +33,8 @@ def learn(
 
 
 def _learn(client: Client) -> bool:
+    from service.schema.results import LearnResult
+
     result = run_task(client, "/v1/learn", {})["result"]
     if result is None:
         return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -13,9 +13,9 @@ from rich.markup import escape
 from hal.errors import InvalidRequest
 from service.commands.common import console
 from service.commands.teach import read_image
-from service.knowledge.photographs import draw_reading, read_pictures
-from service.report.plots import png_of
-from service.schema.results import PhotographMotion, PhotographReading
+
+if TYPE_CHECKING:
+    from service.schema.results import PhotographMotion, PhotographReading
 
 RANGE = ".."
 
@@ -81,6 +81,9 @@ def read(
 
     The exit code is 1 when the instrument cannot be read.
     """
+    from service.knowledge.photographs import draw_reading, read_pictures
+    from service.report.plots import png_of
+
     ends_deg = _span(ends, "--ends")
     pictures = [read_image(photo) for photo in photos]
     found = read_pictures(

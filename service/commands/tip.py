@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from hal.errors import InvalidRequest
@@ -22,6 +22,7 @@ def tip(
     out: Annotated[Path, typer.Option(help="Calibration record of the gripper, whose mount is measured.")],
 ) -> None:
     """Find the tip of the tool from touches of one fixed point, and write it into the gripper's record."""
+    import numpy as np
     from scipy.spatial.transform import RigidTransform, Rotation
 
     from hal.calibration import MountRecord, load_calibration
@@ -74,7 +75,7 @@ def rows_of(path: Path, *, columns: int, hint: str) -> list[list[float]]:
             row = [float(word) for word in words]
         except ValueError:
             row = []
-        if len(row) != columns or not np.isfinite(row).all() or max(abs(value) for value in row[:3]) > 20.0:
+        if len(row) != columns or not all(map(math.isfinite, row)) or max(abs(value) for value in row[:3]) > 20.0:
             raise InvalidRequest(
                 f"{path}, line {number}: {line.strip()!r} has not {columns} plausible numbers", hint=hint
             )

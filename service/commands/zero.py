@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from hal.errors import InvalidRequest
@@ -27,6 +26,8 @@ def zero(
     gripper: Annotated[Path, typer.Option(help="Calibration record of the gripper, whose mount is the fingertips.")],
 ) -> None:
     """Find how far a proximity sensor sits behind the fingertips, and write it into the sensor's record."""
+    import numpy as np
+
     from hal.calibration import load_calibration
     from perception.calibration import calibrate_zero, renewed, to_toml
 

@@ -42,3 +42,33 @@ def test_a_service_starts_without_the_libraries_that_only_computing_needs() -> N
     code = f"import sys, service.serve, service.http.app; print([name for name in {heavy} if name in sys.modules])"
     told = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == "[]"
+
+
+def test_a_command_begins_without_the_libraries_that_only_some_commands_need() -> None:
+    """`panelwright stop` is as fast as the slowest of these imports lets it be, because every command is imported first."""
+    heavy = ("numpy", "scipy", "cv2", "PIL", "fastapi", "service.core", "service.schema.results")
+    code = f"import sys, service.cli; service.cli._app(); print([name for name in {heavy} if name in sys.modules])"
+    told = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+FIRST_CALL = """
+import sys
+import numpy as np
+from hal.jit import load_builtins
+from manipulation.planning.timing_kernels import distances
+{load}
+before = set(sys.modules)
+distances(np.ones(5), 0.1, 0.01)
+print(len([name for name in set(sys.modules) - before if name.startswith("numba.")]))
+"""
+
+
+def test_the_first_call_of_a_kernel_loads_nothing_of_numba_that_was_loaded_before() -> None:
+    def imported(load: str) -> int:
+        code = FIRST_CALL.format(load=load)
+        return int(
+            subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True).stdout
+        )
+
+    assert (imported("load_builtins()"), imported("") > 0) == (0, True)

@@ -11,6 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
+import httpx2
 import pytest
 
 from hal.errors import ConfigError, DeviceUnavailable
@@ -233,9 +234,14 @@ def test_nobody_at_another_port_is_answered_with_that_port() -> None:
 def test_a_request_without_tls_loads_no_authorities(monkeypatch: pytest.MonkeyPatch) -> None:
     """They take 25 ms of the processor for each request, which a program that polls would not leave to the cell."""
 
-    def load(**_given: object) -> ssl.SSLContext:
-        raise AssertionError("authorities are loaded")
+    contexts: list[ssl.SSLContext | bool] = []
 
-    monkeypatch.setattr(ssl, "create_default_context", load)
+    def recorded(**given: Any) -> httpx2.Client:
+        contexts.append(given["verify"])
+        return connect(**given)
+
+    connect = httpx2.Client
+    monkeypatch.setattr(httpx2, "Client", recorded)
     with pytest.raises(DeviceUnavailable):
         Client(url="http://127.0.0.1:9", timeout_s=2.0).get("/readyz")
+    assert [one.cert_store_stats()["x509_ca"] for one in contexts if isinstance(one, ssl.SSLContext)] == [0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import httpx2
@@ -13,6 +14,7 @@ from hal.config import load_cell
 from perception.vision.projection import CameraProjection
 from service.operations import OPERATIONS
 from service.serve import Options, Panelwright
+from service.tasks.model import TaskState
 from tests.perception.vision.bench_panel import TOML, panel, scene
 from tests.service.conftest import WriteCell
 
@@ -53,6 +55,14 @@ def store(web: httpx2.Client, image: np.ndarray) -> str:
     answer = web.post("/v1/images", content=png(image), headers={"Content-Type": "image/png"})
     assert answer.status_code == 201, answer.text
     return str(answer.json()["id"])
+
+
+def ask(web: httpx2.Client, verb: str, body: dict[str, Any]) -> httpx2.Response:
+    """Ask for a verb and return its answer, or the task once it has ended: a busy machine may need longer than one wait."""
+    answer = web.post(f"/v1/{verb}?wait_s=30", json=body)
+    while answer.is_success and not TaskState(answer.json()["state"]).is_final:
+        answer = web.get(f"/v1/tasks/{answer.json()['id']}?wait_s=30")
+    return answer
 
 
 def corners(view: CameraProjection, name: str, half_m: float) -> list[list[float]]:

@@ -23,6 +23,7 @@ from tests.service.shown_panel import (
     PLATE,
     SHOWING_NO_PANEL,
     Shown,
+    ask,
     house,
     is_problem,
     png,
@@ -37,14 +38,21 @@ NAMES = [panel_object.name for panel_object in panel().objects]
 
 def blind(web: httpx2.Client, image: str) -> list[str]:
     look = {"image": image, "mode": "blind", "plate_m": PLATE}
-    found = web.post("/v1/recognise?wait_s=30", json=look).json()["result"]["candidates"]
+    found = ask(web, "recognise", look).json()["result"]["candidates"]
     return [candidate["kind"] for candidate in found if candidate["reason"] is None]
+
+
+def forget(web: httpx2.Client) -> None:
+    for kind in web.get("/v1/knowledge?toml=false").json()["kinds"]:
+        if kind["is_taught"]:
+            assert web.delete(f"/v1/knowledge/kinds/{kind['name']}").status_code == 204
 
 
 def test_a_stored_overview_teaches_what_another_one_shows(web: httpx2.Client, shown: Shown) -> None:
     other, _, _ = scene(tilt_deg=9.0, azimuth_deg=120.0, distance_m=0.7, shown={"mode": "off"}, seed=3)
+    forget(web)  # what this test taught, if it is tried again
     before = blind(web, store(web, other))
-    answer = web.post("/v1/learn?wait_s=30", json={"image": store(web, shown[0])})
+    answer = ask(web, "learn", {"image": store(web, shown[0])})
     assert answer.status_code == 200, answer.text
     taught = answer.json()["result"]
     assert taught["taught_by"] == NAMES and not taught["left_out"]
@@ -55,10 +63,9 @@ def test_a_stored_overview_teaches_what_another_one_shows(web: httpx2.Client, sh
     assert {name for name, kind in kinds.items() if kind["is_taught"]} == set(taught["added"])
     now = blind(web, store(web, other))
     assert "mushroom" not in before and now.count("mushroom") == 1 and len(now) > len(before)
-    again = web.post("/v1/learn?wait_s=30", json={"image": store(web, shown[0])}).json()["result"]
+    again = ask(web, "learn", {"image": store(web, shown[0])}).json()["result"]
     assert again["added"] == {} and again["files"] == []
-    for name in taught["added"]:
-        assert web.delete(f"/v1/knowledge/kinds/{name}").status_code == 204
+    forget(web)
     assert blind(web, store(web, other)) == before, "what was taught is forgotten"
 
 
@@ -70,10 +77,9 @@ def test_a_pose_and_a_lens_may_come_along(web: httpx2.Client, shown: Shown) -> N
         "covariance": view.camera_from_panel.covariance.tolist(),
     }
     body = {"image": store(web, shown[0]), "lens": lens, "camera_from_panel": pose}
-    task = web.post("/v1/learn?wait_s=30", json=body).json()
+    task = ask(web, "learn", body).json()
     assert task["state"] == "succeeded" and task["result"]["known_now"] == NAMES
-    for name in task["result"]["added"]:
-        web.delete(f"/v1/knowledge/kinds/{name}")
+    forget(web)
 
 
 @SHOWING_NO_PANEL

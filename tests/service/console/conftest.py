@@ -10,6 +10,7 @@ import pytest
 from tests.service.browser import browser
 from tests.service.conftest import _write
 from tests.service.console.served import Cell
+from tests.service.waiting import eventually
 
 __all__ = ["browser"]  # a fixture
 
@@ -31,3 +32,13 @@ def page(browser: Any, cell: Cell) -> Iterator[Any]:
     tab.goto(cell.url)
     yield tab
     assert faults == []
+
+
+@pytest.fixture(autouse=True)
+def nothing_runs(request: pytest.FixtureRequest) -> Iterator[None]:
+    """End what a test has left running, because the next one would wait for it."""
+    yield
+    if "cell" in request.fixturenames:
+        tasks = request.getfixturevalue("cell").service.service.tasks
+        tasks.cancel_moving("its test has ended")
+        eventually(lambda: tasks.moving() is None)

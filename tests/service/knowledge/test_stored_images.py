@@ -15,7 +15,7 @@ from PIL import Image as Pillow
 from perception.vision.projection import CameraProjection
 from service.serve import Panelwright
 from tests.perception.vision.bench_panel import panel, scene
-from tests.service.shown_panel import PLATE, SHOWING_NO_PANEL, Shown, house, is_problem, png, shown, store, web
+from tests.service.shown_panel import PLATE, SHOWING_NO_PANEL, Shown, ask, house, is_problem, png, shown, store, web
 
 __all__ = ["house", "shown", "web"]  # fixtures
 
@@ -71,10 +71,6 @@ def test_an_upload_says_that_it_is_an_image_and_is_bounded(web: httpx2.Client, s
     assert answer.status_code == 413
 
 
-def _ask(web: httpx2.Client, verb: str, body: dict[str, Any]) -> httpx2.Response:
-    return web.post(f"/v1/{verb}?wait_s=30", json=body)
-
-
 def test_a_taught_panel_is_read_with_and_without_a_lens(web: httpx2.Client, shown: Shown) -> None:
     image, view = shown
     lens = view.intrinsics
@@ -83,7 +79,7 @@ def test_a_taught_panel_is_read_with_and_without_a_lens(web: httpx2.Client, show
     stored = store(web, image)
     for more in ({}, {"lens": optics}):
         for verb, mode in (("inspect", {}), ("recognise", {"mode": "taught"})):
-            task = _ask(web, verb, {"image": stored, **mode, **more})
+            task = ask(web, verb, {"image": stored, **mode, **more})
             assert task.status_code == 200, task.text
             result = task.json()["result"]
             rows = {row["name"]: row for row in result["objects"]}
@@ -99,14 +95,14 @@ def test_a_stored_image_needs_neither_lease_nor_a_clear_stop_and_teaches_the_cel
 ) -> None:
     stored = store(web, shown[0])
     web.post("/v1/stop")
-    task = _ask(web, "inspect", {"image": stored, "objects": ["pressure"]})
+    task = ask(web, "inspect", {"image": stored, "objects": ["pressure"]})
     assert task.status_code == 200 and task.json()["moves"] is False
     assert not house.service.world.readings
     assert web.post("/v1/stop/reset", json={"seen_count": web.get("/v1/stop").json()["count"]}).status_code == 200
 
 
 def test_blind_recognition_draws_what_it_finds(web: httpx2.Client, shown: Shown) -> None:
-    answer = _ask(web, "recognise", {"image": store(web, shown[0]), "mode": "blind", "plate_m": PLATE})
+    answer = ask(web, "recognise", {"image": store(web, shown[0]), "mode": "blind", "plate_m": PLATE})
     assert answer.status_code == 200, answer.text
     result = answer.json()["result"]
     assert any(c["kind"] == "rotary" and c["reason"] is None for c in result["candidates"])
@@ -128,7 +124,7 @@ def test_blind_recognition_refuses_what_shows_no_panel_or_two(
     words: str,
 ) -> None:  # fmt: skip
     stored = store(web, np.ascontiguousarray(change(shown[0])))
-    is_problem(_ask(web, "recognise", {"image": stored, **mode}), 409, kind, words)
+    is_problem(ask(web, "recognise", {"image": stored, **mode}), 409, kind, words)
 
 
 @pytest.mark.parametrize("verb", ["inspect", "recognise"])
@@ -161,7 +157,7 @@ def test_what_an_image_cannot_answer_is_refused_with_a_reason(
                 "covariance": (1e-6 * np.eye(6)).tolist(),
             },
         }
-    answer = _ask(web, verb, {"image": store(web, np.ascontiguousarray(change(image))), **more})
+    answer = ask(web, verb, {"image": store(web, np.ascontiguousarray(change(image))), **more})
     assert 400 <= answer.status_code < 500, answer.text
     if kind is not None:
         is_problem(answer, 404 if kind.startswith("no-such") else 409, kind, words)
@@ -172,9 +168,7 @@ def test_an_object_that_is_not_there_and_one_in_glare_are_said(web: httpx2.Clien
     dazzled = _bare(image, view)
     u, v = np.rint(view.project([panel().object("pressure").point_m])[0]).astype(int)
     cv2.circle(dazzled, (int(u), int(v)), 78, 255, -1)
-    rows = {
-        row["name"]: row for row in _ask(web, "inspect", {"image": store(web, dazzled)}).json()["result"]["objects"]
-    }
+    rows = {row["name"]: row for row in ask(web, "inspect", {"image": store(web, dazzled)}).json()["result"]["objects"]}
     assert not rows["emergency"]["present"] and "bare plate" in rows["emergency"]["reason"]
     assert rows["pressure"]["value"] is None and rows["pressure"]["reason"]
 
@@ -187,7 +181,7 @@ def test_the_caller_chooses_how_sure_is_sure_enough(web: httpx2.Client, shown: S
     for verb in ("inspect", "recognise"):
 
         def flow(_verb: str = verb, **least: float) -> dict[str, Any]:
-            task = _ask(web, _verb, {"image": stored, "objects": ["flow"], **least})
+            task = ask(web, _verb, {"image": stored, "objects": ["flow"], **least})
             row: dict[str, Any] = task.json()["result"]["objects"][0]
             return row
 
@@ -210,6 +204,6 @@ def test_requests_that_make_no_sense_are_refused(web: httpx2.Client, shown: Show
         ("inspect", {"image": stored, "least_confidence": -0.1}),
         ("inspect", {"image": stored, "camera_from_panel": {"translation_m": [0, 0, 1]}}),
     ):
-        answer = _ask(web, verb, body)
+        answer = ask(web, verb, body)
         assert answer.status_code == 422, answer.text
-    is_problem(_ask(web, "inspect", {"image": "0" * 24}), 404, "no-such-image", "no stored image")
+    is_problem(ask(web, "inspect", {"image": "0" * 24}), 404, "no-such-image", "no stored image")
